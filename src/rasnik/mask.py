@@ -6,16 +6,13 @@ of code cell (0, 0). Field (i, j) covers [i, i + 1) x [j, j + 1) in units of the
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self, overload
+from typing import Any, Literal, Self, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 __all__ = ["ChessField"]
-
-Code = Annotated[int, Field(ge=0)]
-CodeCount = Annotated[int, Field(ge=1)]
 
 
 class ChessField(BaseModel):
@@ -44,15 +41,17 @@ class ChessField(BaseModel):
         Code of the first column and row on the mask, 0 unless only a part is printed.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
-    field_um: float = Field(ge=0.01, le=1e6)
-    code_bits: int = Field(default=8, ge=1, le=24)
-    polarity: Literal["positive", "negative"] = "positive"
-    columns: CodeCount | None = None
-    rows: CodeCount | None = None
-    first_column: Code = 0
-    first_row: Code = 0
+    field_um: float = Field(ge=0.01, le=1e6, description="um, side of one chess field")
+    code_bits: int = Field(default=8, ge=1, le=24, description="bits of a code")
+    polarity: Literal["positive", "negative"] = Field(
+        default="positive", description="positive: fields with even i + j are white"
+    )
+    columns: int | None = Field(default=None, ge=1, description="code cells in x; unset: all")
+    rows: int | None = Field(default=None, ge=1, description="code cells in y; unset: all")
+    first_column: int = Field(default=0, ge=0, description="code of the first column")
+    first_row: int = Field(default=0, ge=0, description="code of the first row")
 
     @model_validator(mode="after")
     def _codes_fit(self) -> Self:

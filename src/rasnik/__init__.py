@@ -1,0 +1,60 @@
+"""Where a coded mask stands, from images of it: analysis and simulation of Rasnik systems.
+
+The names below are loaded when they are first used, so that ``import rasnik`` stays quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+from importlib.metadata import version as _version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rasnik.analysis.analyse import analyse
+    from rasnik.analysis.flags import Flag
+    from rasnik.analysis.pose import Pose
+    from rasnik.imaging.montecarlo import simulate
+    from rasnik.imaging.projection import Projection
+    from rasnik.instrument import System, SystemConfigError, load_system, system_names
+    from rasnik.mask import ChessField
+
+__version__ = _version("rasnik")
+
+__all__ = [
+    "ChessField",
+    "Flag",
+    "Pose",
+    "Projection",
+    "System",
+    "SystemConfigError",
+    "__version__",
+    "analyse",
+    "load_system",
+    "simulate",
+    "system_names",
+]
+
+_HOME = {
+    "ChessField": "rasnik.mask",
+    "Flag": "rasnik.analysis.flags",
+    "Pose": "rasnik.analysis.pose",
+    "Projection": "rasnik.imaging.projection",
+    "System": "rasnik.instrument",
+    "SystemConfigError": "rasnik.instrument",
+    "analyse": "rasnik.analysis.analyse",
+    "load_system": "rasnik.instrument",
+    "simulate": "rasnik.imaging.montecarlo",
+    "system_names": "rasnik.instrument",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOME[name]), name)
+    globals()[name] = value  # the next use finds it without coming here
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
