@@ -1,0 +1,65 @@
+# Everything runs in .venv, which is made here with nothing but Python's own venv and pip.
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+SOURCES := src tests benchmarks
+
+.DELETE_ON_ERROR:
+.PHONY: help demo test lint format bench wheel clean distclean
+
+help:
+	@echo "make demo       simulate a Rasnik, analyse the images, show where the mask was"
+	@echo "make test       run the tests            (ARGS='-k mask' for some of them)"
+	@echo "make lint       ruff and mypy            (make format mends the layout)"
+	@echo "make bench      run the benchmarks"
+	@echo "make wheel      build the package and try it"
+	@echo "make clean      remove what was made     (make distclean: the environment too)"
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "$(PYTHON) is older than 3.11; name a newer one: make PYTHON=python3.12"; exit 1; }
+	$(PYTHON) -m venv .venv
+
+# The stamps are written last, so that an interrupted installation is taken up again.
+.venv/.package: pyproject.toml | $(BIN)/python
+	$(PIP) install --editable .
+	@touch $@
+
+.venv/.dev: pyproject.toml | $(BIN)/python
+	$(PIP) install --editable '.[dev]'
+	@touch $@ .venv/.package
+
+demo: .venv/.package
+	$(BIN)/rasnik demo $(ARGS)
+
+test: .venv/.dev
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: .venv/.dev
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/mypy
+
+format: .venv/.dev
+	$(BIN)/ruff check --fix $(SOURCES)
+	$(BIN)/ruff format $(SOURCES)
+
+bench: .venv/.dev
+	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file" $(ARGS); done
+
+# What is shipped must work without the checkout: systems and type marker included.
+wheel: .venv/.dev
+	rm -rf build/wheel dist
+	$(PIP) wheel --no-deps --wheel-dir dist .
+	$(PIP) install --no-deps --target build/wheel dist/rasnik-*.whl
+	cd build && PYTHONPATH=wheel ../$(BIN)/python -c "import rasnik, pathlib as p; \
+	  here = p.Path(rasnik.__file__).parent; assert here.parent.name == 'wheel', here; \
+	  assert (here / 'py.typed').exists(); \
+	  print('wheel:', *map(rasnik.load_system, rasnik.system_names()), sep='\n  ')"
+
+clean:
+	rm -rf build dist demo site .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +
+
+distclean: clean
+	rm -rf .venv
