@@ -55,7 +55,7 @@ wheel: .venv/.dev
 	cd build && PYTHONPATH=wheel ../$(BIN)/python -c "import rasnik, pathlib as p; \
 	  here = p.Path(rasnik.__file__).parent; assert here.parent.name == 'wheel', here; \
 	  assert (here / 'py.typed').exists(); \
-	  print('wheel:', *map(rasnik.load_system, rasnik.system_names()), sep='\n  ')"
+	  print('wheel has', *[rasnik.load_system(n).name for n in rasnik.system_names()])"
 
 clean:
 	rm -rf build dist demo site .pytest_cache .mypy_cache .ruff_cache .hypothesis
