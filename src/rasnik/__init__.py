@@ -6,7 +6,6 @@ The names below are loaded when they are first used, so that ``import rasnik`` s
 from __future__ import annotations
 
 import importlib
-from importlib.metadata import version as _version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from rasnik.instrument import System, SystemConfigError, load_system, system_names
     from rasnik.mask import ChessField
 
-__version__ = _version("rasnik")
+    __version__: str
 
 __all__ = [
     "ChessField",
@@ -49,9 +48,15 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    value: Any
+    if name == "__version__":
+        from importlib.metadata import version
+
+        value = version("rasnik")
+    elif name in _HOME:
+        value = getattr(importlib.import_module(_HOME[name]), name)
+    else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOME[name]), name)
     globals()[name] = value  # the next use finds it without coming here
     return value
 
