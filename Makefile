@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
-SOURCES := src tests benchmarks
+SOURCES := $(wildcard src tests benchmarks)
 
 .DELETE_ON_ERROR:
 .PHONY: help demo test lint format bench wheel clean distclean
@@ -45,7 +45,7 @@ format: .venv/.dev
 	$(BIN)/ruff format $(SOURCES)
 
 bench: .venv/.dev
-	@set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file" $(ARGS); done
+	@set -e; for file in $(sort $(wildcard benchmarks/[!_]*.py)); do echo "== $$file"; $(BIN)/python "$$file" $(ARGS); done
 
 # What is shipped must work without the checkout: systems and type marker included.
 wheel: .venv/.dev
