@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from rasnik.analysis.analyse import analyse
     from rasnik.analysis.flags import Flag
     from rasnik.analysis.pose import Pose
-    from rasnik.imaging.montecarlo import simulate
     from rasnik.imaging.projection import Projection
+    from rasnik.imaging.simulate import simulate
     from rasnik.instrument import System, SystemConfigError, load_system, system_names
     from rasnik.mask import ChessField
 
@@ -42,7 +42,7 @@ _HOME = {
     "SystemConfigError": "rasnik.instrument",
     "analyse": "rasnik.analysis.analyse",
     "load_system": "rasnik.instrument",
-    "simulate": "rasnik.imaging.montecarlo",
+    "simulate": "rasnik.imaging.simulate",
     "system_names": "rasnik.instrument",
 }
 
