@@ -1,0 +1,382 @@
+"""Decoders: one image file, of whatever format, as a stack of grey images.
+
+A file's format is found from its first bytes, its name is only a hint. Every decoder checks that
+the file is complete: a truncated image is an error, never an image with an empty lower half.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["IMAGE_SUFFIXES", "STACK_SUFFIXES", "ImageFileError", "Stack", "open_stack", "to_grey"]
+
+Image = NDArray[Any]
+
+#: What a folder is searched for.
+IMAGE_SUFFIXES = tuple(".png .tif .tiff .gif .bmp .pgm .ppm .pnm .npy .jpg .jpeg".split())
+#: HDF5 files hold images or results; they are read when named or matched by a pattern.
+STACK_SUFFIXES = (".h5", ".hdf5")
+
+LUMINANCE = (0.299, 0.587, 0.114)
+
+
+class ImageFileError(ValueError):
+    """An image cannot be read; the message says what is wrong and what to do about it."""
+
+
+@dataclass(frozen=True)
+class Stack:
+    """The frames of one open file, read one at a time.
+
+    Attributes
+    ----------
+    count : int
+        Number of frames.
+    read : callable
+        ``read(index)`` gives the image, shape (height, width), and notes on what was done to it.
+    error : str, optional
+        What is wrong with the file after the last of these frames.
+    """
+
+    count: int
+    read: Callable[[int], tuple[Image, tuple[str, ...]]]
+    error: str | None = None
+
+
+def to_grey(colours: Image) -> Image:
+    """Rec. 601 luminance of an image of shape (height, width, 3), not rounded to integers.
+
+    Exactly the common value where the three channels are equal.
+    """
+    red, green, blue = (colours[..., channel] for channel in range(3))
+    if np.array_equal(red, green) and np.array_equal(green, blue):
+        return np.ascontiguousarray(red)
+    weights = np.asarray(LUMINANCE, dtype=np.float64)
+    return (colours[..., :3].astype(np.float64) @ weights).astype(np.float32)
+
+
+def from_channels(pixels: Image) -> tuple[Image, tuple[str, ...]]:
+    """Grey image and notes from (height, width) or (height, width, 1 to 4 channels)."""
+    if pixels.ndim == 2:
+        return pixels, ()
+    channels = pixels.shape[2]
+    notes = []
+    if channels in (2, 4):
+        alpha = pixels[..., -1]
+        if (alpha != alpha.flat[0]).any():
+            notes.append("transparency ignored")
+    if channels <= 2:
+        return np.ascontiguousarray(pixels[..., 0]), tuple(notes)
+    grey = to_grey(pixels[..., :3])
+    if grey.dtype != pixels.dtype or not np.array_equal(pixels[..., 0], pixels[..., 1]):
+        notes.append("colour converted to grey (Rec. 601 luminance)")
+    return grey, tuple(notes)
+
+
+# ------------------------------------------------------------------------ Pillow: PNG, GIF, ...
+
+
+def _png_notes(path: Path) -> tuple[str, ...]:
+    """Pillow keeps the upper 8 of the 16 bits of a colour PNG; say so."""
+    with path.open("rb") as file:
+        head = file.read(26)
+    if head[:4] == b"\x89PNG" and len(head) == 26 and head[24] == 16 and head[25] != 0:
+        return ("the upper 8 of 16 bits were read; store grey 16-bit images to keep all",)
+    return ()
+
+
+def _check_end(path: Path) -> None:
+    """Formats with an end marker: Pillow is content with a file that lacks the last bytes."""
+    with path.open("rb") as file:
+        head = file.read(4)
+        file.seek(max(0, path.stat().st_size - 4096))
+        tail = file.read()
+    complete = True
+    if head == b"\x89PNG":
+        complete = b"IEND" in tail
+    elif head == b"GIF8":
+        complete = tail.rstrip(b"\0").endswith(b";")
+    elif head.startswith(b"\xff\xd8"):
+        complete = b"\xff\xd9" in tail
+    if not complete:
+        raise ImageFileError("the file is truncated (its end is missing); copy it again")
+
+
+@contextmanager
+def open_pillow(path: Path) -> Iterator[Stack]:
+    from PIL import Image as PillowImage
+
+    _check_end(path)
+    extra = _png_notes(path)
+    with PillowImage.open(path, formats=["PNG", "GIF", "BMP", "JPEG", "TIFF"]) as picture:
+        if picture.format == "JPEG":
+            extra += ("JPEG compression has altered the grey levels",)
+
+        def read(index: int) -> tuple[Image, tuple[str, ...]]:
+            picture.seek(index)
+            picture.load()
+            mode = picture.mode
+            if mode in ("P", "CMYK", "YCbCr", "LAB", "HSV", "PA", "RGBX"):
+                pixels = np.asarray(picture.convert("RGB"))
+            elif mode == "1":
+                pixels = np.asarray(picture.convert("L"))
+            else:
+                pixels = np.asarray(picture)
+            grey, notes = from_channels(pixels)
+            return grey, extra + notes
+
+        yield Stack(getattr(picture, "n_frames", 1), read)
+
+
+# ------------------------------------------------------------------------ PGM, PPM
+
+_PNM_TOKEN = re.compile(rb"(?:\s|#[^\n]*\n)*([^\s#]+)")
+
+
+@dataclass(frozen=True)
+class _PnmHeader:
+    kind: bytes
+    width: int
+    height: int
+    maximum: int
+    offset: int
+
+    @property
+    def channels(self) -> int:
+        return 3 if self.kind in (b"P3", b"P6") else 1
+
+    @property
+    def binary(self) -> bool:
+        return self.kind in (b"P5", b"P6")
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return np.dtype("u1" if self.maximum < 256 else ">u2")
+
+    @property
+    def size(self) -> int:
+        return self.width * self.height * self.channels
+
+    @property
+    def end(self) -> int:
+        return self.offset + self.size * self.dtype.itemsize
+
+
+def _pnm_header(data: bytes, start: int) -> _PnmHeader:
+    kind, position, numbers = data[start : start + 2], start + 2, []
+    for _ in range(3):
+        match = _PNM_TOKEN.match(data, position)
+        if match is None or not match[1].isdigit():
+            raise ImageFileError("the PGM header is damaged or cut off; copy the file again")
+        numbers.append(int(match[1]))
+        position = match.end()
+    width, height, maximum = numbers
+    if not (width and height and 0 < maximum < 65536):
+        raise ImageFileError(
+            f"the PGM header gives {width} x {height} pixels and a maximum of {maximum}, which "
+            "is no image; write the file again"
+        )
+    return _PnmHeader(kind, width, height, maximum, position + 1)
+
+
+def _pnm_pixels(data: bytes, header: _PnmHeader) -> Image:
+    if header.binary:
+        found = (len(data) - header.offset) // header.dtype.itemsize
+        values = np.frombuffer(data, header.dtype, min(found, header.size), header.offset)
+    else:
+        text = re.sub(rb"#[^\n]*", b"", data[header.offset :]).split()
+        values = np.array(text[: header.size], dtype=np.int64)
+    if values.size < header.size:
+        raise ImageFileError(
+            f"the file is truncated: {values.size} of {header.size} values are there; copy it again"
+        )
+    pixels = values.astype(np.uint8 if header.maximum < 256 else np.uint16)
+    shape = (header.height, header.width, header.channels)
+    return pixels.reshape(shape)
+
+
+@contextmanager
+def _open_pnm(path: Path) -> Iterator[Stack]:
+    """PGM and PPM, plain or binary, 8 or 16 bit; several images in one file as well.
+
+    Grey levels are as stored, not stretched to the full range of 8 or 16 bits.
+    """
+    data = path.read_bytes()
+    headers = [_pnm_header(data, 0)]
+    while headers[-1].binary:
+        start = headers[-1].end
+        if data[start : start + 2] not in (b"P5", b"P6"):
+            break
+        headers.append(_pnm_header(data, start))
+
+    def read(index: int) -> tuple[Image, tuple[str, ...]]:
+        return from_channels(_pnm_pixels(data, headers[index]))
+
+    yield Stack(len(headers), read)
+
+
+# ------------------------------------------------------------------------ NumPy, HDF5
+
+
+def _frames_of(array: Any, what: str) -> Stack:
+    """Stack from an array-like of shape (height, width), (n, height, width) or with channels."""
+    shape, dtype = tuple(array.shape), np.dtype(array.dtype)
+    if dtype.kind not in "buif":
+        raise ImageFileError(
+            f"{what} holds values of type {dtype}; store grey levels as integers or floats"
+        )
+    has_channels = len(shape) >= 3 and shape[-1] in (3, 4) and shape[-2] > 4
+    grey_shape = shape[:-1] if has_channels else shape
+    if len(grey_shape) not in (2, 3):
+        raise ImageFileError(
+            f"{what} has {len(shape)} dimensions {shape}; store one image (height, width) "
+            "or a stack (frames, height, width)"
+        )
+    if 0 in shape:
+        raise ImageFileError(f"{what} is empty, its shape is {shape}; write it again")
+    single = len(grey_shape) == 2
+
+    def read(index: int) -> tuple[Image, tuple[str, ...]]:
+        pixels = np.array(array[...] if single else array[index])
+        return from_channels(pixels.astype(np.uint8) if pixels.dtype == bool else pixels)
+
+    return Stack(1 if single else grey_shape[0], read)
+
+
+@contextmanager
+def _open_npy(path: Path) -> Iterator[Stack]:
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except ValueError as error:
+        if "mmap length" in str(error) or "EOF" in str(error):
+            raise ImageFileError("the file is truncated; copy it again") from error
+        raise ImageFileError(
+            f"the array cannot be read ({error}); store grey levels as integers or floats"
+        ) from error
+    yield _frames_of(array, "the array")
+
+
+def _hdf5_candidates(file: Any) -> list[str]:
+    """Datasets that can be images: numeric, three-dimensional, else two-dimensional."""
+    import h5py
+
+    found: dict[int, list[str]] = {2: [], 3: []}
+
+    def visit(name: str, item: object) -> None:
+        if isinstance(item, h5py.Dataset) and item.ndim in found and item.dtype.kind in "uif":
+            found[item.ndim].append("/" + name)
+
+    file.visititems(visit)
+    return found[3] or found[2]
+
+
+@contextmanager
+def _open_hdf5(path: Path, dataset: str | None) -> Iterator[Stack]:
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        if dataset is None:
+            names = _hdf5_candidates(file)
+            if not names:
+                raise ImageFileError(
+                    "the HDF5 file holds no image stack; a dataset of shape "
+                    "(frames, height, width) is needed"
+                )
+            if len(names) > 1:
+                raise ImageFileError(
+                    f"the HDF5 file holds several datasets that can be images "
+                    f"({', '.join(names)}); choose one, as in {path.name}:{names[0]}"
+                )
+            dataset = names[0]
+        item = file.get(dataset)
+        if not isinstance(item, h5py.Dataset):
+            names = _hdf5_candidates(file)
+            raise ImageFileError(
+                f"there is no dataset {dataset} in the HDF5 file; "
+                f"it holds {', '.join(names) if names else 'no images'}"
+            )
+        yield _frames_of(item, f"dataset {dataset}")
+
+
+# ------------------------------------------------------------------------ which decoder
+
+
+def _open_tiff(path: Path) -> AbstractContextManager[Stack]:
+    from rasnik.io.tiff import open_tiff
+
+    return open_tiff(path)
+
+
+_MAGIC: tuple[tuple[bytes, Callable[[Path], AbstractContextManager[Stack]]], ...] = (
+    (b"\x89PNG", open_pillow),
+    (b"GIF8", open_pillow),
+    (b"BM", open_pillow),
+    (b"\xff\xd8\xff", open_pillow),
+    (b"II*\0", _open_tiff),
+    (b"MM\0*", _open_tiff),
+    (b"II+\0", _open_tiff),
+    (b"MM\0+", _open_tiff),
+    (b"P2", _open_pnm),
+    (b"P3", _open_pnm),
+    (b"P5", _open_pnm),
+    (b"P6", _open_pnm),
+    (b"\x93NUMPY", _open_npy),
+)
+_HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+
+def open_stack(path: Path, dataset: str | None = None) -> AbstractContextManager[Stack]:
+    """Open an image file.
+
+    Parameters
+    ----------
+    path : Path
+    dataset : str, optional
+        Dataset of an HDF5 file, needed if it holds more than one that can be images.
+
+    Returns
+    -------
+    context manager of Stack
+
+    Raises
+    ------
+    ImageFileError
+        If the file is missing, empty, or of no format known here; and, when it is entered or
+        read, if it is truncated, damaged or has the wrong dimensions.
+    """
+    if not path.exists():
+        raise ImageFileError("no such file; check the name and the folder")
+    if not path.is_file():
+        raise ImageFileError("this is not a file; name image files, or a folder of them")
+    with path.open("rb") as file:
+        head = file.read(8)
+    if not head:
+        raise ImageFileError("the file is empty; copy or record it again")
+    suffix = path.suffix.lower()
+    if head == _HDF5_MAGIC or suffix in STACK_SUFFIXES:
+        if head != _HDF5_MAGIC:
+            raise ImageFileError(f"the content is not HDF5, as {suffix} promises; check the file")
+        return _open_hdf5(path, dataset)
+    if dataset is not None:
+        raise ImageFileError(f"this is not an HDF5 file, so it has no dataset {dataset}")
+    for magic, opener in _MAGIC:
+        if head.startswith(magic):
+            return opener(path)
+    known = ", ".join(s[1:] for s in (*IMAGE_SUFFIXES, *STACK_SUFFIXES))
+    if suffix in IMAGE_SUFFIXES:
+        raise ImageFileError(
+            f"the content is not that of a {suffix} image, nor of any other format read here; "
+            "check the file"
+        )
+    raise ImageFileError(
+        f"{suffix or 'a file without suffix'} is not an image format read here; "
+        f"convert it to one of {known}"
+    )

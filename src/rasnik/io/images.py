@@ -1,0 +1,248 @@
+"""Frames from image files, folders and stacks, one at a time.
+
+A file that cannot be read gives a `Frame` with an error sentence in place of an image; the
+others still come out.
+"""
+
+from __future__ import annotations
+
+import glob
+import os
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rasnik.io.formats import IMAGE_SUFFIXES, ImageFileError, open_stack
+from rasnik.io.lwdaq import lwdaq_bounds
+
+__all__ = ["Frame", "Source", "count_frames", "expand_paths", "iter_frames"]
+
+Bounds = tuple[int, int, int, int]
+PathLike = str | os.PathLike[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image and where it came from.
+
+    Attributes
+    ----------
+    file : str
+        Name of the file as found; ``file.h5:/dataset`` if a dataset was named.
+    frame : int
+        Index within the file, from 0.
+    image : ndarray, shape (height, width), or None
+        Grey levels as stored: integers or floats. None if it could not be read.
+    error : str or None
+        Why there is no image: a sentence with the file's name and what to do.
+    bounds_px : tuple of int or None
+        (left, top, right, bottom) of the picture within the image, in pixels, last column and
+        row included. None: the whole image.
+    header_rows : int
+        Rows at the top that are not picture but data (1 for LWDAQ images).
+    notes : tuple of str
+        What was done to the image on reading it.
+    """
+
+    file: str
+    frame: int = 0
+    image: NDArray[Any] | None = None
+    error: str | None = None
+    bounds_px: Bounds | None = None
+    header_rows: int = 0
+    notes: tuple[str, ...] = ()
+
+    def clip_bounds(self, bounds_px: Bounds | None) -> Bounds | None:
+        """The given bounds, without header rows; by default the frame's own bounds.
+
+        Raises
+        ------
+        ValueError
+            If the bounds do not lie within the image.
+        """
+        if bounds_px is None or self.image is None:
+            return self.bounds_px
+        left, top, right, bottom = bounds_px
+        height, width = self.image.shape
+        if right >= width or bottom >= height:
+            raise ValueError(
+                f"the bounds {left},{top},{right},{bottom} reach beyond the image, whose last "
+                f"column is {width - 1} and last row {height - 1}; give smaller bounds"
+            )
+        top = max(top, self.header_rows)
+        if bottom <= top:
+            raise ValueError(
+                f"the bounds {left},{top},{right},{bottom} leave no picture below the header "
+                "row; give larger bounds"
+            )
+        return left, top, right, bottom
+
+
+@dataclass(frozen=True)
+class Source:
+    """One file to read, or the reason why there is none."""
+
+    name: str
+    path: Path
+    dataset: str | None = None
+    error: str | None = None
+
+
+def _natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """Sort key with numbers by value: frame2 before frame10."""
+    parts = re.split(r"(\d+)", path.name.lower())
+    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
+
+
+def _split_dataset(name: str) -> tuple[str, str | None]:
+    match = re.fullmatch(r"(.*\.(?:h5|hdf5)):(/.*)", name, re.IGNORECASE)
+    return (match[1], match[2]) if match else (name, None)
+
+
+def _expand(name: str) -> list[Source]:
+    file_name, dataset = _split_dataset(name)
+    path = Path(file_name)
+    if path.is_dir():
+        try:
+            entries = sorted(path.iterdir(), key=_natural_key)
+        except OSError as error:
+            reason = error.strerror or str(error)
+            return [Source(name, path, error=f"the folder cannot be read: {reason}")]
+        files = [p for p in entries if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()]
+        suffixes = ", ".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
+        return [Source(str(p), p) for p in files] or [
+            Source(name, path, error=f"the folder holds no images ({suffixes}); name another")
+        ]
+    if not path.exists() and glob.has_magic(file_name):
+        matches = sorted(Path(match) for match in glob.glob(file_name, recursive=True))
+        matches.sort(key=lambda p: (str(p.parent), _natural_key(p)))
+        sources = [Source(str(p), p, dataset) for p in matches if p.is_file()]
+        return sources or [
+            Source(name, path, error="no file matches this pattern; check it and the folder")
+        ]
+    return [Source(name, path, dataset)]
+
+
+def expand_paths(paths: Iterable[PathLike]) -> list[Source]:
+    """Files behind names of files, folders and patterns.
+
+    Folders give the images in them (not those in folders below), sorted naturally; HDF5 files
+    are left out there, since they hold results as often as images. Patterns (``*``, ``?``,
+    ``[]``, ``**``) are expanded here if the shell has not done it. A folder without images and
+    a pattern without matches give one `Source` with an `error`.
+    """
+    return [source for path in paths for source in _expand(os.fspath(path))]
+
+
+def _sentence(name: str, reason: str) -> str:
+    return f"{name}: {reason.rstrip('.')}."
+
+
+def _decoder_failure(path: Path, error: Exception) -> str:
+    """What a decoder's exception means to the user."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    if isinstance(error, PermissionError):
+        return "the file cannot be read: permission denied; change its permissions"
+    if isinstance(error, MemoryError):
+        return "the image is too large for the memory; cut it or split the stack"
+    if re.search(r"truncat|end of file|EOF|not enough|buffer", text, re.IGNORECASE):
+        return f"the file is truncated or damaged ({text}); copy it again"
+    kind = path.suffix[1:].upper() or "image"
+    return (
+        f"the file cannot be read as {kind} ({text}); it is damaged or of an unusual kind, "
+        "save it again as PNG or TIFF"
+    )
+
+
+def _check(image: NDArray[Any]) -> tuple[str, ...]:
+    """Refuse what is no image; note what is odd about it."""
+    if image.ndim != 2 or 0 in image.shape:
+        raise ImageFileError(
+            f"the image has the shape {image.shape}; grey images of (height, width) are needed"
+        )
+    if image.dtype.kind != "f":
+        return ()
+    bad = image.size - int(np.count_nonzero(np.isfinite(image)))
+    if bad == image.size:
+        raise ImageFileError("every pixel is NaN or infinite; check how the image was made")
+    return (f"{bad} of {image.size} pixels are NaN or infinite",) if bad else ()
+
+
+def _frame(source: Source, index: int, image: NDArray[Any], notes: tuple[str, ...]) -> Frame:
+    notes += _check(image)
+    bounds = lwdaq_bounds(image)
+    if bounds is not None:
+        left, top, right, bottom = bounds
+        notes += (f"LWDAQ header in row 0: bounds {left},{top},{right},{bottom}",)
+    return Frame(
+        source.name,
+        index,
+        image,
+        bounds_px=bounds,
+        header_rows=int(bounds is not None),
+        notes=notes,
+    )
+
+
+def _error_frame(source: Source, index: int, error: Exception | str) -> Frame:
+    if isinstance(error, Exception) and not isinstance(error, ImageFileError):
+        error = _decoder_failure(source.path, error)
+    return Frame(source.name, index, error=_sentence(source.name, str(error)))
+
+
+def _frames_of(source: Source) -> Iterator[Frame]:
+    # Decoders raise nearly anything on damaged files, hence the broad excepts.
+    if source.error is not None:
+        yield _error_frame(source, 0, source.error)
+        return
+    try:
+        with open_stack(source.path, source.dataset) as stack:
+            for index in range(stack.count):
+                try:
+                    frame = _frame(source, index, *stack.read(index))
+                except Exception as error:
+                    frame = _error_frame(source, index, error)
+                yield frame
+            if stack.error is not None:
+                yield _error_frame(source, stack.count, stack.error)
+    except Exception as error:
+        yield _error_frame(source, 0, error)
+
+
+def iter_frames(paths: Iterable[PathLike | Source]) -> Iterator[Frame]:
+    """Every frame of the files, folders and patterns named.
+
+    Reads PNG, TIFF (with pages), GIF, BMP, PGM, PPM, JPEG, NPY and HDF5 (two- or
+    three-dimensional; ``file.h5:/dataset`` where there are several). Colour becomes Rec. 601
+    luminance, which is noted. Nothing is kept in memory but the current frame, except a
+    PGM file's bytes.
+
+    Parameters
+    ----------
+    paths : iterable of path-like or Source
+
+    Yields
+    ------
+    Frame
+        One with `error` set, and without image, for each file or frame that cannot be read.
+        The whole frames of a truncated stack are given, and then the error.
+    """
+    for path in paths:
+        for source in [path] if isinstance(path, Source) else _expand(os.fspath(path)):
+            yield from _frames_of(source)
+
+
+def count_frames(source: Source) -> int:
+    """Number of frames `iter_frames` will give for a source; only headers are read."""
+    if source.error is not None:
+        return 1
+    try:
+        with open_stack(source.path, source.dataset) as stack:
+            return stack.count + (stack.error is not None)
+    except Exception:  # reported when the file is read
+        return 1
