@@ -1,0 +1,328 @@
+"""Step 1 of the analysis: the chess lattice from the spectrum of the image.
+
+This is the first half of SOAP (van der Graaf et al., section 4): the strongest peaks of the
+two-dimensional spectrum give pitch and rotation, their phases the shift, harmonics refine them;
+the field centres follow. No prior knowledge but the pixel size is used.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+from numba import njit
+from numpy.typing import NDArray
+
+from rasnik.analysis.flags import Flag
+from rasnik.analysis.lattice import FieldSamples, Lattice
+from rasnik.analysis.picture import Picture, prepare
+from rasnik.analysis.readout import fit_levels
+from rasnik.analysis.sampling import sample_fields
+from rasnik.analysis.tones import ToneLattice, chess_lattice, primary_pair, refine
+
+__all__ = ["LEAST_PIXELS_PER_FIELD", "find_lattice"]
+
+Array = NDArray[np.float64]
+
+#: Below this the pixel washes out the fields.
+LEAST_PIXELS_PER_FIELD = 2.5
+_SMALLEST_IMAGE_PX = 16
+
+# Peaks this close to zero frequency (in bins) are light, not pattern.
+_LEAST_BINS = 2.5
+_PEAKS = 12
+_PAIRS_TRIED = 10
+# Primaries of a square pattern are equal and perpendicular; a slanted view changes both.
+_MOST_LENGTH_RATIO = 1.7
+_LEAST_SINE = math.sin(math.radians(55))
+# A lattice is accepted at once above the first, and at all above the second agreement.
+_GOOD_AGREEMENT = 0.80
+_LEAST_AGREEMENT = 0.68
+# and if that agreement is this many standard deviations away from chance
+_LEAST_SIGNIFICANCE = 5.0
+_NOISE_QUANTILE = 0.2
+
+
+@njit(cache=True)
+def _spectrum_peaks(  # type: ignore[no-untyped-def]  # pragma: no cover
+    spectrum, width, least_bins, most, peak_u, peak_v, peak_power
+):
+    """Strongest local maxima of |spectrum|^2 k^2; returns how many. Also fills `power`."""
+    height, half = spectrum.shape
+    power = np.zeros((height + 2, half + 2), np.float32)
+    for row in range(height):
+        bin_v = row if row <= height // 2 else row - height
+        kv = bin_v / height
+        for column in range(half):
+            ku = column / width
+            if column * column + bin_v * bin_v < least_bins * least_bins:
+                continue
+            value = spectrum[row, column]
+            power[row + 1, column + 1] = (value.real**2 + value.imag**2) * (ku * ku + kv * kv)
+    # the spectrum is periodic in v, and mirrored in the origin beyond u = 0
+    for column in range(half + 2):
+        power[0, column] = power[height, column]
+        power[height + 1, column] = power[1, column]
+    for row in range(1, height + 1):
+        mirror = 1 if row == 1 else height + 2 - row
+        power[row, 0] = power[mirror, 2]
+    found = 0
+    for row in range(1, height + 1):
+        for column in range(1, half + 1):
+            value = power[row, column]
+            if found == most and value <= peak_power[found - 1]:
+                continue
+            if (
+                value <= power[row - 1, column - 1]
+                or value <= power[row - 1, column]
+                or value <= power[row - 1, column + 1]
+                or value <= power[row, column - 1]
+                or value < power[row, column + 1]
+                or value < power[row + 1, column - 1]
+                or value < power[row + 1, column]
+                or value < power[row + 1, column + 1]
+            ):
+                continue
+            bin_v = row - 1 if row - 1 <= height // 2 else row - 1 - height
+            if column == 1 and bin_v < 0:
+                continue  # the same peak stands at +v
+            place = min(found, most - 1)
+            while place > 0 and peak_power[place - 1] < value:
+                peak_power[place] = peak_power[place - 1]
+                peak_u[place] = peak_u[place - 1]
+                peak_v[place] = peak_v[place - 1]
+                place -= 1
+            peak_power[place] = value
+            peak_u[place] = column - 1
+            peak_v[place] = bin_v
+            found = min(found + 1, most)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A lattice under test; `pixel_matrix` acts on image (column, row, 1)."""
+
+    tones: ToneLattice
+    pixel_matrix: Array
+    samples: FieldSamples
+    agreement: float
+    significance: float
+
+
+def find_lattice(
+    image: NDArray[np.float32],
+    pixel_um: float,
+    valid: NDArray[np.bool_] | None = None,
+    *,
+    noise_variance: float | None = None,
+) -> Lattice | Flag:
+    """Find the chess lattice in an image, whatever its scale and rotation.
+
+    Parameters
+    ----------
+    image : ndarray of float32, shape (height, width)
+        Grey levels.
+    pixel_um : float
+        Pixel pitch.
+    valid : ndarray of bool, shape (height, width), optional
+        Usable pixels; all finite ones by default.
+    noise_variance : float, optional
+        Mean variance of a pixel (grey levels squared) for the covariance; by default it is
+        estimated from the floor of the spectrum.
+
+    Returns
+    -------
+    Lattice or Flag
+        The flag says why there is none: `Flag.BLANK`, `Flag.NO_MASK` or `Flag.FIELD_TOO_SMALL`.
+    """
+    image, valid = _clean(image, valid)
+    if min(image.shape) < _SMALLEST_IMAGE_PX or (valid is not None and valid.mean() < 0.05):
+        return Flag.NO_MASK
+    picture = prepare(image, valid)
+    if picture.spread == 0 and not picture.residual.any():
+        return Flag.BLANK
+    spectrum = scipy.fft.rfft2(
+        picture.residual * (picture.window_v[:, None] * picture.window_u), workers=1
+    )
+    if noise_variance is None:
+        noise_variance = _noise_floor(picture, spectrum)
+    best: _Trial | None = None
+    for pair in _candidate_pairs(spectrum, picture.residual.shape[1]):
+        trial = _try_pair(image, valid, picture, pair, noise_variance)
+        if trial is not None and (best is None or trial.agreement > best.agreement):
+            best = trial
+            if trial.agreement > _GOOD_AGREEMENT and trial.significance > _LEAST_SIGNIFICANCE:
+                break
+    if (
+        best is None
+        or best.agreement < _LEAST_AGREEMENT
+        or best.significance < _LEAST_SIGNIFICANCE
+    ):
+        return Flag.BLANK if _is_blank(image, valid) else Flag.NO_MASK
+    return _finish(image, pixel_um, picture, best, noise_variance)
+
+
+def _clean(
+    image: NDArray[np.float32], valid: NDArray[np.bool_] | None
+) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
+    """Contiguous float32 image with finite values, and the mask that leaves others out."""
+    image = np.ascontiguousarray(image, dtype=np.float32)
+    total = float(image.sum(dtype=np.float64))
+    if not np.isfinite(total):
+        finite = np.isfinite(image)
+        valid = finite if valid is None else valid & finite
+    if valid is None or valid.all():
+        return image, None
+    if not valid.any():
+        return image, valid
+    return np.where(valid, image, np.median(image[valid])).astype(np.float32), valid
+
+
+def _is_blank(image: NDArray[np.float32], valid: NDArray[np.bool_] | None) -> bool:
+    """Whether the grey levels span no more than noise does at a constant level."""
+    values = image[::3, ::3] if valid is None else image[valid]
+    low, middle, high = np.percentile(values, (1, 50, 99))
+    whole_numbers = bool((values == np.rint(values)).all())
+    return bool(high - low <= 0.06 * abs(middle) + (8 if whole_numbers else 0))
+
+
+def _noise_floor(picture: Picture, spectrum: NDArray[np.complex64]) -> float:
+    """Variance per pixel from a low quantile of the spectral power (exponential for noise)."""
+    part = spectrum[::3, ::3]
+    power = part.real**2 + part.imag**2
+    quantile = float(np.quantile(power, _NOISE_QUANTILE))
+    windows = np.sum(picture.window_u**2, dtype=float) * np.sum(picture.window_v**2, dtype=float)
+    return quantile / -math.log1p(-_NOISE_QUANTILE) / float(windows)
+
+
+def _candidate_pairs(spectrum: NDArray[np.complex64], width: int) -> list[Array]:
+    """Pairs of peaks that may be the primaries, most likely first; radians per pixel, (2, 2)."""
+    bins_u, bins_v = np.zeros(_PEAKS), np.zeros(_PEAKS)
+    power = np.zeros(_PEAKS, np.float32)
+    found = _spectrum_peaks(spectrum, width, _LEAST_BINS, _PEAKS, bins_u, bins_v, power)
+    wave = 2 * np.pi * np.stack([bins_u / width, bins_v / spectrum.shape[0]], axis=1)[:found]
+    length = np.hypot(wave[:, 0], wave[:, 1])
+    pairs = []
+    for a in range(found):
+        for b in range(a + 1, found):
+            sine = abs(wave[a, 0] * wave[b, 1] - wave[a, 1] * wave[b, 0]) / length[a] / length[b]
+            ratio = max(length[a] / length[b], length[b] / length[a])
+            if sine > _LEAST_SINE and ratio < _MOST_LENGTH_RATIO:
+                pairs.append((float(power[a]) * float(power[b]), a, b))
+    pairs.sort(reverse=True)
+    return [wave[[a, b]] for _, a, b in pairs[:_PAIRS_TRIED]]
+
+
+def _try_pair(
+    image: NDArray[np.float32],
+    valid: NDArray[np.bool_] | None,
+    picture: Picture,
+    pair: Array,
+    noise_variance: float,
+) -> _Trial | None:
+    """Refine a pair of peaks to a lattice and see whether the fields agree with it."""
+    tones = refine(picture, pair)
+    start = primary_pair(tones)
+    if abs(np.linalg.det(start[:, :2])) < 1e-9:
+        return None
+    lattice = chess_lattice(picture, start, noise_variance)
+    left, top, right, bottom = picture.bounds_px
+    to_centre = np.array(
+        [[1.0, 0.0, -(left + right - 1) / 2], [0.0, 1.0, -(top + bottom - 1) / 2], [0.0, 0.0, 1.0]]
+    )
+    pixel_matrix = lattice.matrix @ to_centre
+    samples = sample_fields(image, pixel_matrix, picture.bounds_px, valid)
+    agreement, significance = _agreement(samples)
+    return _Trial(lattice, pixel_matrix, samples, agreement, significance)
+
+
+def _agreement(samples: FieldSamples) -> tuple[float, float]:
+    """Fraction of the fields brighter or darker than their neighbours as the chessboard says.
+
+    Fields are compared with the mean of their four neighbours, so slow changes of the light
+    don't matter. Also returns by how many standard deviations that beats chance.
+    """
+    grey, there = samples.grey, samples.present
+    whole = (
+        there[1:-1, 1:-1]
+        & there[:-2, 1:-1]
+        & there[2:, 1:-1]
+        & there[1:-1, :-2]
+        & there[1:-1, 2:]
+    )
+    count = int(whole.sum())
+    if count < 9:
+        return 0.0, 0.0
+    around = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:]
+    contrast = (grey[1:-1, 1:-1] - around / 4) * samples.chess[1:-1, 1:-1]
+    agreement = float((contrast[whole] > 0).mean())
+    return agreement, (agreement - 0.5) * 2 * math.sqrt(count)
+
+
+def _finish(
+    image: NDArray[np.float32],
+    pixel_um: float,
+    picture: Picture,
+    trial: _Trial,
+    noise_variance: float,
+) -> Lattice | Flag:
+    height, width = image.shape
+    matrix = trial.pixel_matrix.copy()
+    # from (column, row) to micrometres from the centre of the image
+    matrix[:, 2] += matrix[:, :2] @ [(width - 1) / 2, (height - 1) / 2]
+    matrix[:, :2] /= pixel_um
+    pixels_per_field = 1 / (math.sqrt(abs(np.linalg.det(matrix[:, :2]))) * pixel_um)
+    if pixels_per_field < LEAST_PIXELS_PER_FIELD:
+        return Flag.FIELD_TOO_SMALL
+    levels = fit_levels(trial.samples)
+    if levels is None:
+        return Flag.NO_MASK
+    blur_px = trial.tones.blur_px
+    if math.isnan(blur_px):
+        blur_px = _blur_from_mixing(levels.side, levels.own) * pixels_per_field
+    return Lattice(
+        matrix=matrix,
+        covariance=_to_image_centre(trial.tones.covariance, picture, image.shape, pixel_um),
+        pixels_per_field=pixels_per_field,
+        blur_um=math.sqrt(max(blur_px**2 - 1 / 12, 0.0)) * pixel_um,
+        dark=levels.middle - levels.half,
+        light=levels.middle + levels.half,
+        noise_variance=noise_variance,
+        score=trial.agreement,
+        shape=(height, width),
+        pixel_um=pixel_um,
+        bounds_px=picture.bounds_px,
+        samples=trial.samples,
+    )
+
+
+def _to_image_centre(
+    covariance: Array, picture: Picture, shape: tuple[int, int], pixel_um: float
+) -> Array:
+    """Covariance of the matrix about the image's centre in um, from the picture's in pixels."""
+    left, top, right, bottom = picture.bounds_px
+    shift_u, shift_v = (shape[1] - left - right) / 2, (shape[0] - top - bottom) / 2
+    block = np.array(
+        [[1 / pixel_um, 0.0, 0.0], [0.0, 1 / pixel_um, 0.0], [shift_u, shift_v, 1.0]]
+    )
+    change = np.kron(np.eye(2), block)
+    return change @ covariance @ change.T
+
+
+def _blur_from_mixing(side: float, own: float) -> float:
+    """Gaussian sigma in fields for which a side neighbour gives side/own of the light."""
+    ratio = min(max(side / own, 0.0), 0.45)
+    if ratio == 0:
+        return 0.0
+    own_part = 1 / (1 + 2 * ratio)  # in one dimension
+    low, high = 0.01, 2.0
+    for _ in range(40):
+        middle = (low + high) / 2
+        low, high = (middle, high) if math.erf(0.5 / middle / math.sqrt(2)) > own_part else (
+            low,
+            middle,
+        )
+    return low

@@ -1,0 +1,227 @@
+"""Phases and wave vectors of spatial frequencies, to the noise limit, and the lattice they make.
+
+A discrete Fourier transform knows integer frequencies only. Here the windowed transform is
+evaluated at exact wave vectors, with its first moments: for a pure tone the moment divided by
+the transform tells how far the wave vector is off, and the phase at the window's centroid does
+not depend on that error. The sums are separable under any rotation, so they are two small
+matrix products.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rasnik.analysis.picture import Picture
+
+__all__ = ["ToneLattice", "Tones", "chess_lattice", "measure", "primary_pair", "refine"]
+
+Array = NDArray[np.float64]
+Complexes = NDArray[np.complex128]
+
+# Tones (n, m) of the chess pattern used for the lattice: wave vector pi (n grad p + m grad q).
+# Both odd; the negative of a tone is the same tone.
+_TONES = np.array(
+    [(1, -1), (1, 1), (3, -1), (3, 1), (1, -3), (1, 3), (3, -3), (3, 3),
+     (5, -1), (5, 1), (1, -5), (1, 5), (7, -1), (7, 1), (1, -7), (1, 7)]
+)  # fmt: skip
+# A harmonic counts if its amplitude is this many times its noise ...
+_HARMONIC_SIGNIFICANCE = 8.0
+# ... and its phase is where the primary tones expect it (rad).
+_HARMONIC_TOLERANCE = 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class Tones:
+    """The windowed transform of a picture at given wave vectors.
+
+    Attributes
+    ----------
+    wave : ndarray, shape (n, 2)
+        Wave vectors (radians per pixel).
+    transform : ndarray of complex, shape (n,)
+        Sum of window x residual x exp(-i wave . position).
+    offset : ndarray, shape (n, 2)
+        Estimate of (true wave vector) - `wave`.
+    """
+
+    wave: Array
+    transform: Complexes
+    offset: Array
+
+
+def measure(picture: Picture, wave: Array) -> Tones:
+    """Evaluate the windowed transform of `picture` at each wave vector, shape (n, 2)."""
+    u, v = picture.u_px, picture.v_px
+    along_u = picture.window_u[:, None] * np.exp(-1j * np.outer(u, wave[:, 0]))
+    along_v = picture.window_v[:, None] * np.exp(-1j * np.outer(v, wave[:, 1]))
+    moment_u = u[:, None] * along_u
+    basis = np.hstack([along_u.real, along_u.imag, moment_u.real, moment_u.imag])
+    scale = 1.0 / max(picture.u_px[-1], 1.0)
+    basis[:, 2 * len(wave) :] *= scale
+    parts = (picture.residual @ basis.astype(np.float32)).astype(np.float64)
+    plain_re, plain_im, first_re, first_im = np.split(parts, 4, axis=1)
+    plain, first = plain_re + 1j * plain_im, (first_re + 1j * first_im) / scale
+    transform = np.einsum("vn,vn->n", along_v, plain)
+    by_u = np.einsum("vn,vn->n", along_v, first)
+    by_v = np.einsum("vn,vn->n", v[:, None] * along_v, plain)
+    safe = np.where(transform == 0, 1.0, transform)
+    variance = window_variance(picture)
+    offset = np.stack([(by_u / safe).imag / variance[0], (by_v / safe).imag / variance[1]], axis=1)
+    return Tones(wave=wave, transform=transform, offset=offset)
+
+
+def window_variance(picture: Picture) -> tuple[float, float]:
+    """Second moments of the window along u and v, pixels squared."""
+    wu, wv = picture.window_u.astype(float), picture.window_v.astype(float)
+    return (
+        float((wu * picture.u_px**2).sum() / wu.sum()),
+        float((wv * picture.v_px**2).sum() / wv.sum()),
+    )
+
+
+def refine(picture: Picture, wave: Array, steps: int = 3) -> Tones:
+    """Follow each wave vector to the nearest maximum of the spectrum.
+
+    The steps are limited to one bin of the transform, so a start within a bin is needed.
+    """
+    height, width = picture.residual.shape
+    limit = np.array([2 * np.pi / width, 2 * np.pi / height])
+    start = wave
+    for _ in range(steps):
+        tones = measure(picture, wave)
+        wave = np.clip(wave + tones.offset, start - 1.5 * limit, start + 1.5 * limit)
+    return measure(picture, wave)
+
+
+def primary_pair(tones: Tones) -> Array:
+    """Field coordinates in which the first two tones are the primaries of a chess pattern.
+
+    Returns
+    -------
+    ndarray, shape (2, 3)
+        (p, q) = result @ (u_px, v_px, 1) from the centre of the picture, with p growing
+        rightward and q upward within 45 degrees.
+    """
+    # The pattern with bright fields at even i + j is  cos pi(p - q) - cos pi(p + q)  to first
+    # order: one tone has positive, the other negative amplitude, whichever way they are labelled.
+    best, best_value = np.zeros((2, 3)), -np.inf
+    for first, second in ((0, 1), (1, 0)):
+        difference = np.append(tones.wave[first], np.angle(tones.transform[first]))
+        total = np.append(tones.wave[second], np.angle(tones.transform[second]) + np.pi)
+        for sign in (1, -1):
+            for other in (1, -1):
+                p = (sign * difference + other * total) / (2 * np.pi)
+                q = (other * total - sign * difference) / (2 * np.pi)
+                norm = np.hypot(*p[:2]) + np.hypot(*q[:2])
+                value = (p[0] - q[1]) / norm
+                if p[0] * q[1] - p[1] * q[0] < 0 and value > best_value:
+                    best, best_value = np.stack([p, q]), value
+    return best
+
+
+@dataclass(frozen=True, eq=False)
+class ToneLattice:
+    """A chess lattice from the phases of its tones, in pixels from the picture's centre.
+
+    Attributes
+    ----------
+    matrix : ndarray, shape (2, 3)
+        (p, q) = matrix @ (u_px, v_px, 1).
+    covariance : ndarray, shape (6, 6)
+        Of ``matrix.ravel()``, from white pixel noise.
+    blur_px : float
+        Gaussian sigma of everything that blurs, the pixel included; NaN if unknown.
+    amplitude : float
+        Amplitude of the primary tones (grey levels).
+    """
+
+    matrix: Array
+    covariance: Array
+    blur_px: float
+    amplitude: float
+
+
+def chess_lattice(picture: Picture, matrix: Array, noise_variance: float) -> ToneLattice:
+    """Refine a lattice with the primary tones and all harmonics that stand out of the noise.
+
+    Each tone (n, m) measures the combination n p0 + m q0 of the phases and n grad p + m grad q of
+    the wave vectors; they are combined by weighted least squares. White noise makes their errors
+    independent, and those of phases and wave vectors too (symmetric window).
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (2, 3)
+        Start (see `primary_pair`).
+    noise_variance : float
+        Variance of a pixel, grey levels squared.
+    """
+    for _ in range(2):
+        waves = np.pi * _TONES @ matrix[:, :2]
+        below_nyquist = np.abs(waves).max(axis=1) < np.pi
+        orders = _TONES[below_nyquist | (np.arange(len(_TONES)) < 2)]
+        tones = measure(picture, np.pi * orders @ matrix[:, :2])
+        step, covariance, used = _lattice_step(picture, orders, tones, matrix, noise_variance)
+        matrix = matrix + step
+    amplitude = 2 * np.abs(tones.transform) / _window_sum(picture)
+    return ToneLattice(
+        matrix=matrix,
+        covariance=covariance,
+        blur_px=_blur(orders[used], tones.wave[used], amplitude[used]),
+        amplitude=float(np.sqrt(amplitude[0] * amplitude[1])),
+    )
+
+
+def _window_sum(picture: Picture) -> float:
+    return float(picture.window_u.sum(dtype=float) * picture.window_v.sum(dtype=float))
+
+
+def _lattice_step(
+    picture: Picture, orders: Array, tones: Tones, matrix: Array, noise_variance: float
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Least-squares change of `matrix`, its covariance, and the tones used."""
+    wu2, wv2 = picture.window_u.astype(float) ** 2, picture.window_v.astype(float) ** 2
+    power = np.abs(tones.transform) ** 2
+    noise_power = max(noise_variance, 1e-12) * wu2.sum() * wv2.sum()
+    # sign of the amplitude: positive for (n, -m), negative for (n, m), n and m > 0
+    expected = np.pi * orders @ matrix[:, 2] + np.where(orders[:, 1] > 0, np.pi, 0.0)
+    error = np.angle(tones.transform * np.exp(-1j * expected))
+    error = np.mod(error + np.pi / 2, np.pi) - np.pi / 2  # defocus may invert a harmonic
+    used = (power > _HARMONIC_SIGNIFICANCE**2 * noise_power) & (
+        np.abs(error) < _HARMONIC_TOLERANCE
+    )
+    used[:2] = True
+    weight = np.where(used, 2 * power / noise_power, 0.0)
+
+    step = np.zeros((2, 3))
+    covariance = np.zeros((6, 6))
+    variances = window_variance(picture)
+    spread = (
+        (wu2 * picture.u_px**2).sum() / wu2.sum() / variances[0] ** 2,
+        (wv2 * picture.v_px**2).sum() / wv2.sum() / variances[1] ** 2,
+        1.0,
+    )
+    normal = np.einsum("n,ni,nj->ij", weight, orders, orders)
+    inverse = np.linalg.inv(normal)
+    for column, value in enumerate((tones.offset[:, 0], tones.offset[:, 1], error)):
+        step[:, column] = inverse @ (orders.T @ (weight * value)) / np.pi
+        covariance[np.ix_([column, column + 3], [column, column + 3])] = (
+            inverse * spread[column] / np.pi**2
+        )
+    return step, covariance, used
+
+
+def _blur(orders: Array, waves: Array, amplitude: Array) -> float:
+    """Gaussian sigma (pixels) from the fading of the harmonics, NaN with the primaries alone."""
+    if len(orders) < 3:
+        return float("nan")
+    square = (waves**2).sum(axis=1)
+    level = np.log(amplitude * np.abs(orders.prod(axis=1)))
+    weight = amplitude**2
+    mean_square, mean_level = np.average(square, weights=weight), np.average(level, weights=weight)
+    slope = np.sum(weight * (square - mean_square) * (level - mean_level)) / np.sum(
+        weight * (square - mean_square) ** 2
+    )
+    return float(np.sqrt(max(-2 * slope, 0.0)))
