@@ -4,7 +4,7 @@ The hard-edged mask, blurred by the optics and integrated over square pixels, is
 where the optics transfer no detail. A window of fields somewhat larger than the view, taken
 as periodic, is then a finite Fourier series whose coefficients are known in closed form:
 
-    fields (DFT) x unit field (sinc sinc) x optics (OTF) x pixel (sinc sinc),
+    sum over fields (sinc sinc, with its phase) x optics (OTF) x pixel (sinc sinc),
 
 the last two at the frequency that the harmonic has on the sensor, hence right under any
 rotation or affine map. Summing the series at the pixel centres gives the image to `ACCURACY`
@@ -17,11 +17,11 @@ within the pixel, blur spread over 11 x 11 pixels) this one replaces by its exac
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 
 from rasnik.imaging.levels import LevelMap, level_at
@@ -183,13 +183,38 @@ class _Tile:
 
 
 @dataclass(frozen=True)
-class _Window:
-    """The fields that a tile sees: first field and number of fields along x and y."""
+class _Span:
+    """What a tile sees along one axis of the mask, taken as one period."""
 
-    first: tuple[int, int]
-    count: tuple[int, int]
-    highest: tuple[int, int]  # harmonic along x and y
+    low_um: float
+    length_um: float
+    highest: int  # harmonic
+
+    def fields(self, field_um: float) -> tuple[int, int]:
+        """First field in the span, and the one after the last."""
+        high_um = self.low_um + self.length_um
+        return math.floor(self.low_um / field_um), math.ceil(high_um / field_um)
+
+    def field_series(self, field_um: float, k: NDArray[np.int64]) -> NDArray[np.complex128]:
+        """Harmonics k of each field (the part of it in the span), shape (k.size, fields)."""
+        first, end = self.fields(field_um)
+        edges = (np.arange(first, end + 1) * field_um - self.low_um) / self.length_um
+        edges = np.clip(edges, 0, 1)
+        width, middle = np.diff(edges), (edges[:-1] + edges[1:]) / 2
+        k = k[:, None]
+        return np.asarray(width * np.sinc(k * width) * np.exp(-2j * np.pi * k * middle))
+
+
+@dataclass(frozen=True)
+class _Window:
+    x: _Span
+    y: _Span
     jacobian: NDArray[np.float64]
+
+    @property
+    def lengths(self) -> tuple[int, int]:
+        """Fine grid (rows, columns)."""
+        return grid_lengths((self.y.highest, self.x.highest))
 
 
 @dataclass(frozen=True)
@@ -220,7 +245,7 @@ class _Scene:
         for split in _SPLITS:
             tiles = self._cut(split)
             middle = tiles[len(tiles) // 2]
-            points = float(np.prod(grid_lengths(self._window(middle).highest)))
+            points = float(np.prod(self._window(middle).lengths))
             cost = len(tiles) * points * (1.0 if points <= _CACHED_POINTS else 1.3)
             if points > _TILE_POINTS or self._change(middle) > _TILE_CHANGE:
                 continue
@@ -257,64 +282,48 @@ class _Scene:
         corners = self.projection.to_mask(u, v[:, None])
         reach = self.transfer.reach_um + self.pitch_um / np.sqrt(2)
         inverse = np.linalg.inv(jacobian)
-        first, count, highest = [], [], []
+        spans = []
         for axis in (0, 1):
             cutoff = self.transfer.cutoff_per_um * np.hypot(*inverse[:, axis])
             margin = max(
                 reach * np.hypot(*jacobian[axis]) * (1 + _TILE_CHANGE),
                 GUARD / (2 * OVERSAMPLING * cutoff),
             )
-            low = int(np.floor((corners[axis].min() - margin) / self.mask.field_um))
-            high = int(np.ceil((corners[axis].max() + margin) / self.mask.field_um))
-            first.append(low)
-            count.append(high - low)
-            highest.append(int(np.ceil(cutoff * (high - low) * self.mask.field_um)))
-        return _Window(
-            (first[0], first[1]), (count[0], count[1]), (highest[0], highest[1]), jacobian
-        )
+            low, high = corners[axis].min() - margin, corners[axis].max() + margin
+            spans.append(_Span(low, high - low, math.ceil(cutoff * (high - low))))
+        return _Window(spans[0], spans[1], jacobian)
 
     def render(self, tile: _Tile) -> NDArray[np.float64]:
         window = self._window(tile)
-        kx, ky = window.highest
-        lengths = grid_lengths((ky, kx))
-        coefficients = self._coefficients(window, lengths)
+        (rows, columns), x, y = window.lengths, window.x, window.y
         # From pixels of this tile to fine grid steps of its window. The origin of the window
         # is taken off first: on a large mask it is where the digits would be lost.
-        field = self.mask.field_um
-        shift = np.eye(3)
-        shift[:2, 2] = [-i * field for i in window.first]
-        steps = [n / (c * field) for n, c in zip(lengths[::-1], window.count, strict=True)]
+        shift = np.array([[1, 0, -x.low_um], [0, 1, -y.low_um], [0, 0, 1]])
+        steps = np.diag([columns / x.length_um, rows / y.length_um, 1])
         to_tile = np.array([[1, 0, tile.column], [0, 1, tile.row], [0, 0, 1.0]])
-        matrix = (
-            np.diag([*steps, 1.0])
-            @ (shift @ self.projection.matrix)
-            @ self.pixel_to_sensor()
-            @ to_tile
+        matrix = steps @ (shift @ self.projection.matrix) @ self.pixel_to_sensor() @ to_tile
+        return evaluate_series(
+            self._coefficients(window), (rows, columns), matrix, (tile.height, tile.width)
         )
-        return evaluate_series(coefficients, lengths, matrix, (tile.height, tile.width))
 
-    def _coefficients(self, window: _Window, lengths: tuple[int, int]) -> NDArray[np.complex128]:
-        (nx, ny), (kx, ky) = window.count, window.highest
-        (i0, j0), field = window.first, self.mask.field_um
-        k = np.arange(kx + 1)
-        m = np.r_[0 : ky + 1, -ky:0]
-        # Frequency on the sensor, in cycles per pixel, as sums of a row and a column.
-        (a, b), (c, d) = window.jacobian * self.pitch_um / field
-        u_x, u_y, v_x, v_y = a * k / nx, c * m / ny, b * k / nx, d * m / ny
-        response = self.transfer(
+    def _coefficients(self, window: _Window) -> NDArray[np.complex128]:
+        x, y, field_um = window.x, window.y, self.mask.field_um
+        rows, columns = window.lengths
+        k = np.arange(x.highest + 1)
+        m = np.r_[0 : y.highest + 1, -y.highest : 0]
+        along_x = x.field_series(field_um, k) / kernel_transform(k / columns)[:, None]
+        along_y = y.field_series(field_um, m) / kernel_transform(m / rows)[:, None]
+        fields = self.mask.fields(*x.fields(field_um), *y.fields(field_um))
+        coefficients = along_y @ (fields @ along_x.T)
+        # Frequency on the sensor, in cycles per pixel, as sums of a column's and a row's part.
+        (a, b), (c, d) = window.jacobian * self.pitch_um
+        u_x, v_x = a * k / x.length_um, b * k / x.length_um
+        u_y, v_y = c * m / y.length_um, d * m / y.length_um
+        coefficients *= self.transfer(
             (u_x + u_y[:, None]) / self.pitch_um, (v_x + v_y[:, None]) / self.pitch_um
         )
-        response = response * _sinc_of_sum(u_x, u_y)
-        response *= _sinc_of_sum(v_x, v_y)
-        # The unit field, the first one centred half a field from the origin of the window.
-        along_x = np.sinc(k / nx) * np.exp(-1j * np.pi * k / nx)
-        along_y = np.sinc(m / ny) * np.exp(-1j * np.pi * m / ny)
-        transmission = self.mask.fields(i0, i0 + nx, j0, j0 + ny).astype(np.float64)
-        fields = scipy.fft.fft2(transmission, norm="forward")
-        columns = fields[:, k % nx] * (along_x / kernel_transform(k / lengths[1]))
-        coefficients = columns[m % ny]
-        coefficients *= (along_y / kernel_transform(m / lengths[0]))[:, None]
-        coefficients *= response
+        coefficients *= _sinc_of_sum(u_x, u_y)
+        coefficients *= _sinc_of_sum(v_x, v_y)
         return np.asarray(coefficients)
 
 
