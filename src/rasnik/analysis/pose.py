@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rasnik.analysis.flags import FLAGS, Flag
+from rasnik.imaging.appearance import Appearance
 from rasnik.imaging.projection import Projection
 
 __all__ = ["PARAMETERS", "Candidate", "Pose"]
@@ -79,6 +80,8 @@ class Pose:
         The poses that explain the image, best first, when it is ambiguous.
     projection : Projection or None
         The full map from sensor to mask.
+    appearance : Appearance or None
+        Light, blur and edges as fitted (a prior for the next frame).
     method : str
         ``"likelihood"``, ``"fourier"``, or ``"none"`` if nothing was found.
     model : str
@@ -104,6 +107,7 @@ class Pose:
     flags: Flag = Flag.NONE
     candidates: tuple[Candidate, ...] = ()
     projection: Projection | None = None
+    appearance: Appearance | None = None
     method: str = "none"
     model: str = "similarity"
 

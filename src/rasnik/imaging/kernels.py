@@ -11,8 +11,9 @@ cumulants, added as derivatives of M (see `rasnik.imaging.model`).
 
 Pixels are worked on in tiles of TILE x TILE. Every step is a short loop over the pixels of a
 tile without branches, which the compiler turns into vector instructions (longer ones it
-gives up on); the intermediate values are rows of one small array that stays in the cache. How many fields a corner feels is
-passed as the length of a tuple, a constant to the compiler, so that its loops are unrolled.
+gives up on); the intermediate values are rows of one small array that stays in the cache.
+How many fields a corner feels is passed as the length of a tuple, a constant to the
+compiler, so that its loops are unrolled.
 """
 
 from __future__ import annotations
@@ -23,7 +24,17 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["MAX_REACH", "N_PRODUCTS", "N_SIGNALS", "RESIDUAL", "TILE", "Scene", "gram", "render"]
+__all__ = [
+    "LEVEL",
+    "MAX_REACH",
+    "N_PRODUCTS",
+    "N_SIGNALS",
+    "RESIDUAL",
+    "TILE",
+    "Scene",
+    "gram",
+    "render",
+]
 
 TILE = 16
 LANES = TILE * TILE
@@ -465,9 +476,21 @@ def gram(image, valid, tiles, noise, scene):
 
 
 @_compiled
-def render(height, width, scene):
-    """Signals of every pixel, shape (N_SIGNALS, H, W); the last is the grey level."""
-    out = np.empty((N_SIGNALS, height, width), dtype=np.float32)
+def render(height, width, scene, rows_wanted):
+    """Some of the signals for every pixel.
+
+    Parameters
+    ----------
+    height, width : int
+    scene : Scene
+    rows_wanted : int64, shape (n,)
+        Which signals: 0..6, or LEVEL for the expected grey level.
+
+    Returns
+    -------
+    ndarray of float32, shape (n, height, width)
+    """
+    out = np.empty((rows_wanted.size, height, width), dtype=np.float32)
     work = np.zeros((WORK_ROWS, STRIDE), dtype=np.float32)
     index = np.zeros((3, LANES), dtype=np.int32)
     for row0 in range(0, height, TILE):
@@ -475,8 +498,8 @@ def render(height, width, scene):
         for column0 in range(0, width, TILE):
             columns = min(TILE, width - column0)
             signals(work, index, scene, row0, column0, rows, columns)
-            for a in range(N_SIGNALS):
-                source = LEVEL if a == RESIDUAL else a
+            for a in range(rows_wanted.size):
+                source = rows_wanted[a]
                 for row in range(rows):
                     for column in range(columns):
                         out[a, row0 + row, column0 + column] = work[source, row * TILE + column]

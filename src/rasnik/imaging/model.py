@@ -18,122 +18,22 @@ rotated by tens of degrees) the pixel is divided into parts.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rasnik.imaging import kernels
+from rasnik.imaging.appearance import Appearance, Camera
 from rasnik.imaging.profile import edge_table
 from rasnik.imaging.projection import Projection
 from rasnik.mask import ChessField
 
-__all__ = [
-    "Appearance",
-    "Camera",
-    "expected_image",
-    "expected_signals",
-    "make_scene",
-    "surface",
-    "tile_products",
-]
+__all__ = ["expected_image", "expected_signals", "make_scene", "tile_products"]
 
 #: Largest error of the expected pattern that the choice of pixel parts allows.
 PATTERN_TOLERANCE = 7e-5
 
 #: Smallest blur that is modelled, in pixels; below it the edges are sharper than the pixel.
 MIN_BLUR_PX = 0.2
-
-
-@dataclass(frozen=True)
-class Camera:
-    """The pixel grid of a frame.
-
-    Attributes
-    ----------
-    shape : tuple of int
-        (height, width).
-    pixel_um : float
-        Pitch of the pixels as read out.
-    reference_px : tuple of float, optional
-        (column, row) of the reference point; the centre of the array by default.
-    """
-
-    shape: tuple[int, int]
-    pixel_um: float
-    reference_px: tuple[float, float] | None = None
-
-    @property
-    def origin_um(self) -> tuple[float, float]:
-        """(u, v) of the centre of pixel (row 0, column 0)."""
-        height, width = self.shape
-        column, row = self.reference_px or ((width - 1) / 2, (height - 1) / 2)
-        return -column * self.pixel_um, -row * self.pixel_um
-
-    @property
-    def half_size_um(self) -> tuple[float, float]:
-        """Half the width and half the height of the array."""
-        return self.shape[1] * self.pixel_um / 2, self.shape[0] * self.pixel_um / 2
-
-    @property
-    def corners_um(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """u and v of the outer corners of the array, shape (4,) each."""
-        (u0, v0), (height, width) = self.origin_um, self.shape
-        u = u0 + self.pixel_um * (np.array([0, 1, 0, 1]) * width - 0.5)
-        v = v0 + self.pixel_um * (np.array([0, 0, 1, 1]) * height - 0.5)
-        return u, v
-
-    @property
-    def centre_um(self) -> tuple[float, float]:
-        """(u, v) of the centre of the array."""
-        u, v = self.corners_um
-        return float(u.mean()), float(v.mean())
-
-
-def surface(u: ArrayLike, v: ArrayLike, order: int = 2) -> NDArray[np.float64]:
-    """Monomials 1, u, v, u^2, uv, v^2 (up to `order`) of normalised coordinates.
-
-    Returns
-    -------
-    ndarray, shape (1 or 3 or 6, ...)
-    """
-    u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
-    terms = [np.ones_like(u), u, v, u * u, u * v, v * v]
-    return np.stack(terms[: (order + 1) * (order + 2) // 2])
-
-
-@dataclass(frozen=True, eq=False)
-class Appearance:
-    """How the mask looks: light, blur and edges. Nuisances to a position, all of them.
-
-    Attributes
-    ----------
-    dark, light : ndarray, shape (6,)
-        Grey level of black and white: coefficients of `surface`, with u and v in units of
-        half the image size from the reference point.
-    blur_um : float
-        Gaussian sigma of the optical blur, on the sensor.
-    edge_shift_um : float
-        By how much black fields are larger than nominal at each edge, on the mask.
-    kurtosis : float
-        Excess kurtosis of the blur: 0 for a Gaussian, negative for defocus, positive
-        for a halo.
-    """
-
-    dark: NDArray[np.float64]
-    light: NDArray[np.float64]
-    blur_um: float
-    edge_shift_um: float = 0.0
-    kurtosis: float = 0.0
-
-    @classmethod
-    def uniform(cls, dark: float, light: float, blur_um: float) -> Appearance:
-        """Even light and Gaussian blur."""
-        return cls(np.array([dark, 0.0, 0, 0, 0, 0]), np.array([light, 0.0, 0, 0, 0, 0]), blur_um)
-
-    def with_(self, **changes: object) -> Appearance:
-        """A copy with some attributes changed."""
-        return replace(self, **changes)  # type: ignore[arg-type]
 
 
 def _pixel_parts(jacobian: NDArray[np.float64], pixel: float, blur_um: float) -> int:
@@ -212,9 +112,7 @@ def make_scene(
     )
 
 
-def _local_jacobian(
-    matrix: NDArray[np.float64], point: tuple[float, float]
-) -> NDArray[np.float64]:
+def _local_jacobian(matrix: NDArray[np.float64], point: tuple[float, float]) -> NDArray[np.float64]:
     homogeneous = matrix @ np.array([*point, 1.0])
     w = homogeneous[2]
     jacobian: NDArray[np.float64] = (
@@ -246,27 +144,36 @@ def expected_image(
     -------
     ndarray of float32, shape (H, W)
     """
-    return expected_signals(mask, projection, appearance, camera)[-1]
+    return expected_signals(mask, projection, appearance, camera, (kernels.LEVEL,))[0]
 
 
 def expected_signals(
-    mask: ChessField, projection: Projection, appearance: Appearance, camera: Camera
+    mask: ChessField,
+    projection: Projection,
+    appearance: Appearance,
+    camera: Camera,
+    signals: tuple[int, ...] = (*range(kernels.N_SIGNALS - 1), kernels.LEVEL),
 ) -> NDArray[np.float32]:
     """Expected grey level of every pixel and its derivatives.
 
     The derivatives by mask position leave out that the pixel turns and scales about its
     own centre with the pose: a relative error of 1e-3 at most.
 
+    Parameters
+    ----------
+    signals : tuple of int, optional
+        Which ones; all by default.
+
     Returns
     -------
-    ndarray of float32, shape (8, H, W)
+    ndarray of float32, shape (len(signals), H, W)
         Derivatives by mask X and Y (grey per field), by dark and by light level (1), by blur
         variance (grey per um^2 on the sensor), by edge shift (grey per field), by the
         fourth cumulant of the blur (grey per um^4); and the grey level itself.
     """
     scene = make_scene(mask, projection, appearance, camera)
-    signals: NDArray[np.float32] = kernels.render(*camera.shape, scene)
-    return signals
+    planes: NDArray[np.float32] = kernels.render(*camera.shape, scene, np.array(signals))
+    return planes
 
 
 def tile_products(

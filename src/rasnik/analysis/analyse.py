@@ -1,0 +1,292 @@
+"""From a frame to its pose, in one call.
+
+The frame's way: `prepare_frame` (what pixels there are) -> `find_lattice` (where the fields
+lie) -> `read_fields` and `decode` (which fields they are) -> `fit` (where exactly). With a
+prior pose the first steps are left out, as long as the result proves itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rasnik.analysis.decode import Decoding, LabelledLattice, decode
+from rasnik.analysis.flags import FLAGS, Flag
+from rasnik.analysis.fourier import find_lattice
+from rasnik.analysis.frame import Bounds, prepare_frame, resolve_instrument
+from rasnik.analysis.lattice import Lattice
+from rasnik.analysis.likelihood import Fit, Frame, fit
+from rasnik.analysis.parameters import Model, State
+from rasnik.analysis.pose import Candidate, Pose
+from rasnik.analysis.readout import read_fields
+from rasnik.imaging.appearance import Appearance
+from rasnik.imaging.model import MIN_BLUR_PX
+from rasnik.imaging.projection import ORIENTATIONS, Projection
+from rasnik.instrument import System
+
+__all__ = ["Method", "analyse"]
+
+Method = Literal["likelihood", "fourier"]
+
+# How far a refined pose may be from where it started, in fields: less than half a field,
+# beyond which another field would be taken for this one.
+_MOST_MOTION_FIELDS = 0.35
+_PRIOR_MOTION_FIELDS = 0.8
+_LEAST_EXPLAINED = 0.5
+_PRIOR_EXPLAINED = 0.9
+_HEAVILY_MASKED = 0.25
+_FATAL = Flag(sum(info.flag for info in FLAGS if info.fatal))
+
+
+def analyse(
+    image: NDArray[np.generic],
+    system: System | str | None = None,
+    *,
+    field_um: float | None = None,
+    pixel_um: float | None = None,
+    method: Method = "likelihood",
+    model: Model | Literal["auto"] = "auto",
+    orientation: int | None = None,
+    prior: Pose | None = None,
+    bounds: Bounds | None = None,
+) -> Pose:
+    """Find where the mask is in one image.
+
+    Parameters
+    ----------
+    image : ndarray, shape (H, W)
+        Grey levels, integer or float. Row 0 is the top.
+    system : System or str, optional
+        The instrument: an object, a preset's name or a TOML file. Its grey levels, blur,
+        scale and rotation are not used: they are found from the image.
+    field_um, pixel_um : float, optional
+        Side of the chess fields and pitch of the pixels, instead of a system; the noise
+        is then estimated from the image.
+    method : {"likelihood", "fourier"}
+        Maximum likelihood to the bound, or the spectrum's phases alone.
+    model : {"auto", "similarity", "affine", "projective"}
+        Map from mask to image; "auto" takes the simplest that the image allows.
+    orientation : int, optional
+        How the mask's axes lie in the image (1..4); found from the image by default, or
+        from the system if that has one. With it, theta_z covers the full circle.
+    prior : Pose, optional
+        A pose nearby (of the frame before, say); spares finding the mask from nothing.
+    bounds : tuple of int, optional
+        (left, top, right, bottom) pixel of the picture, all included; the rest is ignored.
+        The reference point stays the centre of the whole array.
+
+    Returns
+    -------
+    Pose
+        With ``ok`` False, NaN values and a flag that says why if there is no position.
+
+    Raises
+    ------
+    ValueError
+        For arguments that contradict each other, or an image of the wrong shape or size.
+
+    Examples
+    --------
+    >>> from rasnik import analyse, simulate
+    >>> simulation = simulate("solidras", (4000.0, 5000.0, 0.002), seed=1)
+    >>> pose = analyse(simulation.frames[0], "solidras")
+    >>> pose.ok, round(pose.x_um, 2), round(pose.y_um, 2)
+    (True, 4000.0, 5000.0)
+    """
+    mask, pitch, loaded = resolve_instrument(system, field_um, pixel_um)
+    if orientation is None and loaded is not None:
+        orientation = loaded.optics.orientation
+    _check_options(method, model, orientation)
+    frame, flags = prepare_frame(image, mask, pitch, loaded, bounds)
+    if prior is not None and prior.ok and method == "likelihood":
+        pose = _from_prior(frame, prior, model, flags)
+        if pose is not None:
+            return pose
+        flags |= Flag.PRIOR_REJECTED
+    lattice = find_lattice(frame.image, pitch, _as_mask(frame))
+    if isinstance(lattice, Flag):
+        return Pose(flags=flags | lattice)
+    decoding = decode(read_fields(lattice), lattice, mask, orientation)
+    decoding = _settled_by_prior(decoding, prior, mask.field_um)
+    flags |= decoding.flags
+    if not decoding.ok or decoding.best is None:
+        return _undecided(lattice, decoding, flags)
+    if method == "fourier":
+        raise NotImplementedError
+    return _refined(frame, lattice, decoding, decoding.best, model, flags)
+
+
+def _check_options(method: str, model: str, orientation: int | None) -> None:
+    if method not in ("likelihood", "fourier"):
+        raise ValueError(f"method must be 'likelihood' or 'fourier', not {method!r}")
+    if model not in ("auto", "similarity", "affine", "projective"):
+        raise ValueError(
+            f"model must be 'auto', 'similarity', 'affine' or 'projective', not {model!r}"
+        )
+    if method == "fourier" and model not in ("auto", "similarity"):
+        raise ValueError(f"method 'fourier' knows only the similarity, not {model!r}")
+    if orientation is not None and orientation not in ORIENTATIONS:
+        raise ValueError(f"orientation must be 1, 2, 3 or 4, not {orientation!r}")
+
+
+def _with_polarity(frame: Frame, polarity: str) -> Frame:
+    """The frame with the polarity that was found; masks exist as positive and negative."""
+    if frame.mask.polarity == polarity:
+        return frame
+    return replace(frame, mask=frame.mask.model_copy(update={"polarity": polarity}))
+
+
+def _as_mask(frame: Frame) -> NDArray[np.bool_] | None:
+    return None if frame.valid.all() else frame.valid > 0
+
+
+# --------------------------------------------------------------------- from nothing
+
+
+def _refined(
+    frame: Frame,
+    lattice: Lattice,
+    decoding: Decoding,
+    best: LabelledLattice,
+    model: Model | Literal["auto"],
+    flags: Flag,
+) -> Pose:
+    frame = _with_polarity(frame, best.polarity)
+    blur = max(lattice.blur_um, 2 * MIN_BLUR_PX * frame.camera.pixel_um)
+    start = State(best.projection, Appearance(lattice.dark, lattice.light, blur))
+    try:
+        result = fit(frame, start, model=model)
+    except ValueError:
+        return Pose(flags=flags | Flag.NOT_CONVERGED, method="likelihood")
+    moved = _motion_fields(frame, start.projection, result.state.projection)
+    if moved > _MOST_MOTION_FIELDS or result.explained < _LEAST_EXPLAINED or not result.converged:
+        flags |= Flag.NOT_CONVERGED
+    return replace(
+        _pose(frame, result, best.orientation, flags),
+        polarity=best.polarity,
+        code_lines_read=decoding.lines_read,
+        code_lines_in_view=decoding.lines_in_view,
+    )
+
+
+def _undecided(lattice: Lattice, decoding: Decoding, flags: Flag) -> Pose:
+    """No position: what else is known, and the candidates."""
+    candidates = []
+    for one in decoding.candidates:
+        scale, theta, _ = one.projection.similarity(one.orientation)
+        projection = one.projection
+        candidates.append(
+            Candidate(projection.x_um, projection.y_um, scale, theta, one.orientation, one.log_odds)
+        )
+    return Pose(
+        flags=flags,
+        candidates=tuple(candidates) if flags & Flag.AMBIGUOUS else (),
+        blur_um=lattice.blur_um,
+        dark_level=float(lattice.dark[0]),
+        light_level=float(lattice.light[0]),
+        code_lines_read=decoding.lines_read,
+        code_lines_in_view=decoding.lines_in_view,
+    )
+
+
+def _settled_by_prior(decoding: Decoding, prior: Pose | None, field_um: float) -> Decoding:
+    """The candidate that a prior pose points at, if exactly one is within four fields of it."""
+    if prior is None or not prior.ok or not decoding.flags & Flag.AMBIGUOUS:
+        return decoding
+    near = [
+        one
+        for one in decoding.candidates
+        if one.orientation == prior.orientation
+        and np.hypot(one.projection.x_um - prior.x_um, one.projection.y_um - prior.y_um)
+        < 4 * field_um
+    ]
+    if len(near) != 1:
+        return decoding
+    return replace(decoding, best=near[0], flags=decoding.flags & ~Flag.AMBIGUOUS)
+
+
+# --------------------------------------------------------------------- from a prior
+
+
+def _from_prior(
+    frame: Frame, prior: Pose, model: Model | Literal["auto"], flags: Flag
+) -> Pose | None:
+    """Refine a prior pose; None unless the result proves itself.
+
+    A prior that is off by whole fields fits the chessboard but not the code: parts of the
+    image then stand out, or much is left unexplained.
+    """
+    if prior.projection is None or prior.appearance is None:
+        return None
+    frame = _with_polarity(frame, prior.polarity)
+    start = State(prior.projection, prior.appearance)
+    try:
+        result = fit(frame, start, model=model, trust_start=True)
+    except ValueError:
+        return None
+    moved = _motion_fields(frame, start.projection, result.state.projection)
+    if (
+        not (result.converged and result.clean)
+        or moved > _PRIOR_MOTION_FIELDS
+        or result.explained < _PRIOR_EXPLAINED
+    ):
+        return None
+    return replace(
+        _pose(frame, result, prior.orientation, flags),
+        polarity=prior.polarity,
+        code_lines_read=prior.code_lines_read,
+        code_lines_in_view=prior.code_lines_in_view,
+    )
+
+
+# --------------------------------------------------------------------- results
+
+
+def _motion_fields(frame: Frame, before: Projection, after: Projection) -> float:
+    """Largest motion of the pattern at the corners and the centre of the image, in fields."""
+    u, v = frame.camera.corners_um
+    u, v = np.append(u, 0.0), np.append(v, 0.0)
+    (x0, y0), (x1, y1) = before.to_mask(u, v), after.to_mask(u, v)
+    return float(np.hypot(x1 - x0, y1 - y0).max() / frame.mask.field_um)
+
+
+def _pose(frame: Frame, result: Fit, orientation: int, flags: Flag) -> Pose:
+    state = result.state
+    projection, appearance = state.projection, state.appearance
+    masked = 1.0 - np.count_nonzero(result.valid) / result.valid.size
+    flags |= result.flags
+    if masked > _HEAVILY_MASKED:
+        flags |= Flag.HEAVILY_MASKED
+    if result.model != "similarity":
+        flags |= Flag.AFFINE if result.model == "affine" else Flag.PROJECTIVE
+    dark, light = float(appearance.dark[0]), float(appearance.light[0])
+    if light - dark < 5 * np.sqrt(max(result.noise[0] + result.noise[1] * light, 0.0)):
+        flags |= Flag.LOW_CONTRAST
+    if not light > dark:
+        flags |= Flag.NOT_CONVERGED
+    if flags & _FATAL:
+        return Pose(flags=flags, method="likelihood", masked_fraction=masked)
+    scale, theta, _ = projection.similarity(orientation)
+    return Pose(
+        ok=True,
+        x_um=projection.x_um,
+        y_um=projection.y_um,
+        scale=scale,
+        theta_rad=theta,
+        orientation=orientation,
+        covariance=result.covariance,
+        chi2_ndf=result.chi2_ndf,
+        blur_um=appearance.blur_um,
+        dark_level=dark,
+        light_level=light,
+        edge_shift_um=appearance.edge_shift_um,
+        masked_fraction=masked,
+        flags=flags,
+        projection=projection,
+        appearance=appearance,
+        method="likelihood",
+        model=result.model,
+    )
