@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from rasnik.analysis.flags import Flag
 from rasnik.analysis.labelling import Labelling, labellings
 from rasnik.analysis.lattice import Lattice
-from rasnik.analysis.readout import LLR_BOUND, Readout, read_fields
+from rasnik.analysis.readout import LLR_BOUND_BRIGHT, LLR_BOUND_DARK, Readout
 from rasnik.imaging.projection import Projection
 from rasnik.mask import ChessField
 
@@ -25,8 +25,8 @@ __all__ = ["LabelledLattice", "Decoding", "decode"]
 
 Array = NDArray[np.float64]
 
-#: Log-odds by which a position must beat every other one.
-LEAST_MARGIN = 15.0
+#: Log-odds by which a position must beat every other one: more than any single field can give.
+LEAST_MARGIN = LLR_BOUND_BRIGHT + 0.5
 # Hypotheses this far below the best are not listed.
 _WINDOW = 30.0
 _MOST_CANDIDATES = 16
@@ -352,7 +352,7 @@ def _check(one: _Hypothesis, mask: ChessField) -> tuple[int, int, bool]:
     i = np.arange(columns) - one.offset_i + one.column * period
     j = np.arange(rows) - one.offset_j + one.row * period
     inverted = mask.inverted(i, j[:, None])
-    sure = 0.75 * LLR_BOUND
+    sure = 0.75 * LLR_BOUND_DARK
     seen = (llr > sure) & labelling.present
     certain = (np.abs(llr) > sure) & labelling.present
     explained = (seen & inverted).sum() / max(1, seen.sum())

@@ -16,10 +16,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rasnik.analysis.flags import Flag
-from rasnik.analysis.lattice import FieldSamples, Lattice
+from rasnik.analysis.lattice import Lattice
+from rasnik.analysis.levels import fit_levels
 from rasnik.analysis.picture import Picture, prepare
-from rasnik.analysis.readout import fit_levels
-from rasnik.analysis.sampling import sample_fields
+from rasnik.analysis.sampling import FieldSamples, sample_fields
 from rasnik.analysis.tones import ToneLattice, chess_lattice, primary_pair, refine
 
 __all__ = ["LEAST_PIXELS_PER_FIELD", "find_lattice"]
@@ -43,6 +43,7 @@ _LEAST_AGREEMENT = 0.68
 # and if that agreement is this many standard deviations away from chance
 _LEAST_SIGNIFICANCE = 5.0
 _NOISE_QUANTILE = 0.2
+_NOISE_FREQUENCY = 0.2  # cycles per pixel
 
 
 @njit(cache=True)
@@ -170,8 +171,7 @@ def _clean(
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_] | None]:
     """Contiguous float32 image with finite values, and the mask that leaves others out."""
     image = np.ascontiguousarray(image, dtype=np.float32)
-    total = float(image.sum(dtype=np.float64))
-    if not np.isfinite(total):
+    if not np.isfinite(image.sum()):
         finite = np.isfinite(image)
         valid = finite if valid is None else valid & finite
     if valid is None or valid.all():
@@ -190,10 +190,13 @@ def _is_blank(image: NDArray[np.float32], valid: NDArray[np.bool_] | None) -> bo
 
 
 def _noise_floor(picture: Picture, spectrum: NDArray[np.complex64]) -> float:
-    """Variance per pixel from a low quantile of the spectral power (exponential for noise)."""
-    part = spectrum[::3, ::3]
-    power = part.real**2 + part.imag**2
-    quantile = float(np.quantile(power, _NOISE_QUANTILE))
+    """Variance per pixel from the spectral power (exponential for noise) where both frequencies
+    are high: a low quantile, since the pattern only adds to it.
+    """
+    height, width = picture.residual.shape
+    high_v = slice(int(_NOISE_FREQUENCY * height), int((1 - _NOISE_FREQUENCY) * height))
+    part = spectrum[high_v, int(_NOISE_FREQUENCY * width) :][::2, ::2]
+    quantile = float(np.quantile(part.real**2 + part.imag**2, _NOISE_QUANTILE))
     windows = np.sum(picture.window_u**2, dtype=float) * np.sum(picture.window_v**2, dtype=float)
     return quantile / -math.log1p(-_NOISE_QUANTILE) / float(windows)
 
@@ -288,14 +291,14 @@ def _finish(
         covariance=_to_image_centre(trial.tones.covariance, picture, image.shape, pixel_um),
         pixels_per_field=pixels_per_field,
         blur_um=math.sqrt(max(blur_px**2 - 1 / 12, 0.0)) * pixel_um,
-        dark=levels.middle - levels.half,
-        light=levels.middle + levels.half,
         noise_variance=noise_variance,
         score=trial.agreement,
         shape=(height, width),
         pixel_um=pixel_um,
         bounds_px=picture.bounds_px,
+        tones=trial.tones,
         samples=trial.samples,
+        levels=levels,
     )
 
 

@@ -7,48 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["FieldSamples", "Lattice", "quadratic_basis"]
+from rasnik.analysis.levels import Levels
+from rasnik.analysis.sampling import FieldSamples
+from rasnik.analysis.tones import ToneLattice
+
+__all__ = ["Lattice"]
 
 Array = NDArray[np.float64]
-
-
-def quadratic_basis(u: ArrayLike, v: ArrayLike) -> Array:
-    """The terms 1, u, v, u^2, u v, v^2 in the last axis; `u` and `v` broadcast."""
-    u, v = np.broadcast_arrays(np.asarray(u, float), np.asarray(v, float))
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-
-
-@dataclass(frozen=True, eq=False)
-class FieldSamples:
-    """Grey levels at the field centres of a lattice.
-
-    Attributes
-    ----------
-    first_i, first_j : int
-        Lattice indices of element [0, 0].
-    grey : ndarray, shape (nj, ni), float64
-        Mean grey level of the central part of field (first_i + column, first_j + row).
-    present : ndarray of bool, shape (nj, ni)
-        Whether the central part of the field is in view.
-    u, v : ndarray, shape (nj, ni)
-        Field centre on the sensor in units of half the image width and height.
-    """
-
-    first_i: int
-    first_j: int
-    grey: Array
-    present: NDArray[np.bool_]
-    u: Array
-    v: Array
-
-    @property
-    def chess(self) -> Array:
-        """+1 where the chessboard is bright (i + j even), -1 where it is dark."""
-        rows, columns = self.grey.shape
-        parity = np.add.outer(
-            np.arange(rows) + self.first_j, np.arange(columns) + self.first_i
-        )
-        return 1.0 - 2.0 * (parity % 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +33,9 @@ class Lattice:
     pixels_per_field : float
         Side of a field on the sensor (root of its area) in pixels.
     blur_um : float
-        Gaussian sigma of the blur on the sensor without the pixel, estimated from how fast the
-        harmonics fade; good to some ten per cent, NaN if it cannot be told.
-    dark, light : ndarray, shape (6,)
-        Grey levels of wide black and white areas: coefficients of `quadratic_basis` in sensor
-        coordinates divided by half the image width and height.
+        Gaussian sigma of the blur on the sensor without the pixel, from how fast the harmonics
+        fade or, where there are none, from the mixing of neighbouring fields; good to some ten
+        per cent.
     noise_variance : float
         Variance of a pixel (grey levels squared) behind `covariance`.
     score : float
@@ -83,21 +46,40 @@ class Lattice:
     pixel_um : float
     bounds_px : tuple of int
         (left, top, right, bottom) of the picture inside dark borders, right and bottom exclusive.
+    tones : ToneLattice
+        The spectral lines behind `matrix`.
     samples : FieldSamples
+        Grey levels of the field centres.
+    levels : Levels
+        Dark and light grey levels fitted to them.
     """
 
     matrix: Array
     covariance: Array
     pixels_per_field: float
     blur_um: float
-    dark: Array
-    light: Array
     noise_variance: float
     score: float
     shape: tuple[int, int]
     pixel_um: float
     bounds_px: tuple[int, int, int, int]
+    tones: ToneLattice = field(repr=False)
     samples: FieldSamples = field(repr=False)
+    levels: Levels = field(repr=False)
+
+    @property
+    def dark(self) -> Array:
+        """Grey level of wide black areas, shape (6,).
+
+        Coefficients of ``1, u, v, u^2, u v, v^2`` (`quadratic_basis`), with the sensor coordinates
+        divided by half the image's width and height.
+        """
+        return self.levels.middle - self.levels.half
+
+    @property
+    def light(self) -> Array:
+        """Grey level of wide white areas, as `dark`."""
+        return self.levels.middle + self.levels.half
 
     def to_field(self, u_um: ArrayLike, v_um: ArrayLike) -> tuple[Array, Array]:
         """Field coordinates (p, q) of sensor points in micrometres; arguments broadcast."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Picture", "picture_bounds", "prepare"]
+__all__ = ["Picture", "hann", "picture_bounds", "prepare"]
 
 Floats = NDArray[np.float32]
 
@@ -97,8 +97,8 @@ def prepare(image: Floats, valid: NDArray[np.bool_] | None = None) -> Picture:
         residual *= usable
     return Picture(
         residual=residual,
-        window_u=_hann(width),
-        window_v=_hann(height),
+        window_u=hann(width),
+        window_v=hann(height),
         u_px=np.arange(width) - (width - 1) / 2,
         v_px=np.arange(height) - (height - 1) / 2,
         bounds_px=bounds,
@@ -113,7 +113,8 @@ def _centre_and_spread(sample: Floats) -> tuple[np.float32, float]:
     return np.float32(centre), float(np.median(np.abs(sample - centre)))
 
 
-def _hann(count: int) -> Floats:
+def hann(count: int) -> Floats:
+    """Hann window over `count` pixels, zero half a pixel outside the first and last."""
     phase = 2 * np.pi * (np.arange(count) + 0.5) / count
     return (0.5 - 0.5 * np.cos(phase)).astype(np.float32)
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rasnik.analysis.picture import Picture
 
-__all__ = ["ToneLattice", "Tones", "chess_lattice", "measure", "primary_pair", "refine"]
+__all__ = ["ToneLattice", "Tones", "chess_lattice", "combine", "measure", "primary_pair", "refine"]
 
 Array = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -55,22 +55,34 @@ class Tones:
 def measure(picture: Picture, wave: Array) -> Tones:
     """Evaluate the windowed transform of `picture` at each wave vector, shape (n, 2)."""
     u, v = picture.u_px, picture.v_px
-    along_u = picture.window_u[:, None] * np.exp(-1j * np.outer(u, wave[:, 0]))
-    along_v = picture.window_v[:, None] * np.exp(-1j * np.outer(v, wave[:, 1]))
-    moment_u = u[:, None] * along_u
-    basis = np.hstack([along_u.real, along_u.imag, moment_u.real, moment_u.imag])
-    scale = 1.0 / max(picture.u_px[-1], 1.0)
-    basis[:, 2 * len(wave) :] *= scale
+    n = len(wave)
+    along_u = _waves(u, wave[:, 0], picture.window_u)  # [cos, -sin]
+    basis = np.hstack([along_u, along_u * (u / u[-1])[:, None]])
     parts = (picture.residual @ basis.astype(np.float32)).astype(np.float64)
-    plain_re, plain_im, first_re, first_im = np.split(parts, 4, axis=1)
-    plain, first = plain_re + 1j * plain_im, (first_re + 1j * first_im) / scale
-    transform = np.einsum("vn,vn->n", along_v, plain)
-    by_u = np.einsum("vn,vn->n", along_v, first)
-    by_v = np.einsum("vn,vn->n", v[:, None] * along_v, plain)
+    along_v = _waves(v, wave[:, 1], picture.window_v)
+    cosine, sine = along_v[:, :n], along_v[:, n:]
+
+    def sum_over_v(real: Array, imag: Array, weight: Array | float = 1.0) -> Complexes:
+        c, s = cosine * weight, sine * weight
+        total: Complexes = (c * real - s * imag).sum(axis=0) + 1j * (c * imag + s * real).sum(
+            axis=0
+        )
+        return total
+
+    plain, first = (parts[:, :n], parts[:, n : 2 * n]), (parts[:, 2 * n : 3 * n], parts[:, 3 * n :])
+    transform = sum_over_v(*plain)
+    by_u = sum_over_v(*first) * u[-1]
+    by_v = sum_over_v(*plain, v[:, None])
     safe = np.where(transform == 0, 1.0, transform)
     variance = window_variance(picture)
     offset = np.stack([(by_u / safe).imag / variance[0], (by_v / safe).imag / variance[1]], axis=1)
     return Tones(wave=wave, transform=transform, offset=offset)
+
+
+def _waves(position: Array, wave: Array, window: NDArray[np.float32]) -> Array:
+    """Real and imaginary parts of window x exp(-i wave position), side by side, (m, 2 n)."""
+    phase = np.outer(position, wave)
+    return np.hstack([np.cos(phase), -np.sin(phase)]) * window[:, None]
 
 
 def window_variance(picture: Picture) -> tuple[float, float]:
@@ -82,7 +94,7 @@ def window_variance(picture: Picture) -> tuple[float, float]:
     )
 
 
-def refine(picture: Picture, wave: Array, steps: int = 3) -> Tones:
+def refine(picture: Picture, wave: Array, steps: int = 2) -> Tones:
     """Follow each wave vector to the nearest maximum of the spectrum.
 
     The steps are limited to one bin of the transform, so a start within a bin is needed.
@@ -132,6 +144,10 @@ class ToneLattice:
         (p, q) = matrix @ (u_px, v_px, 1).
     covariance : ndarray, shape (6, 6)
         Of ``matrix.ravel()``, from white pixel noise.
+    orders : ndarray of int, shape (n, 2)
+        The tones used.
+    weight : ndarray, shape (n,)
+        Inverse variance of their phases (rad^-2).
     blur_px : float
         Gaussian sigma of everything that blurs, the pixel included; NaN if unknown.
     amplitude : float
@@ -140,16 +156,14 @@ class ToneLattice:
 
     matrix: Array
     covariance: Array
+    orders: NDArray[np.int64]
+    weight: Array
     blur_px: float
     amplitude: float
 
 
 def chess_lattice(picture: Picture, matrix: Array, noise_variance: float) -> ToneLattice:
     """Refine a lattice with the primary tones and all harmonics that stand out of the noise.
-
-    Each tone (n, m) measures the combination n p0 + m q0 of the phases and n grad p + m grad q of
-    the wave vectors; they are combined by weighted least squares. White noise makes their errors
-    independent, and those of phases and wave vectors too (symmetric window).
 
     Parameters
     ----------
@@ -158,30 +172,12 @@ def chess_lattice(picture: Picture, matrix: Array, noise_variance: float) -> Ton
     noise_variance : float
         Variance of a pixel, grey levels squared.
     """
-    for _ in range(2):
-        waves = np.pi * _TONES @ matrix[:, :2]
-        below_nyquist = np.abs(waves).max(axis=1) < np.pi
-        orders = _TONES[below_nyquist | (np.arange(len(_TONES)) < 2)]
-        tones = measure(picture, np.pi * orders @ matrix[:, :2])
-        step, covariance, used = _lattice_step(picture, orders, tones, matrix, noise_variance)
-        matrix = matrix + step
-    amplitude = 2 * np.abs(tones.transform) / _window_sum(picture)
-    return ToneLattice(
-        matrix=matrix,
-        covariance=covariance,
-        blur_px=_blur(orders[used], tones.wave[used], amplitude[used]),
-        amplitude=float(np.sqrt(amplitude[0] * amplitude[1])),
-    )
+    waves = np.pi * _TONES @ matrix[:, :2]
+    below_nyquist = np.abs(waves).max(axis=1) < np.pi
+    below_nyquist[:2] = True
+    orders = _TONES[below_nyquist]
+    tones = measure(picture, waves[below_nyquist])
 
-
-def _window_sum(picture: Picture) -> float:
-    return float(picture.window_u.sum(dtype=float) * picture.window_v.sum(dtype=float))
-
-
-def _lattice_step(
-    picture: Picture, orders: Array, tones: Tones, matrix: Array, noise_variance: float
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Least-squares change of `matrix`, its covariance, and the tones used."""
     wu2, wv2 = picture.window_u.astype(float) ** 2, picture.window_v.astype(float) ** 2
     power = np.abs(tones.transform) ** 2
     noise_power = max(noise_variance, 1e-12) * wu2.sum() * wv2.sum()
@@ -193,9 +189,9 @@ def _lattice_step(
         np.abs(error) < _HARMONIC_TOLERANCE
     )
     used[:2] = True
-    weight = np.where(used, 2 * power / noise_power, 0.0)
+    orders, weight = orders[used], 2 * power[used] / noise_power
+    step, inverse = combine(orders, weight, error[used], tones.offset[used])
 
-    step = np.zeros((2, 3))
     covariance = np.zeros((6, 6))
     variances = window_variance(picture)
     spread = (
@@ -203,17 +199,51 @@ def _lattice_step(
         (wv2 * picture.v_px**2).sum() / wv2.sum() / variances[1] ** 2,
         1.0,
     )
-    normal = np.einsum("n,ni,nj->ij", weight, orders, orders)
-    inverse = np.linalg.inv(normal)
-    for column, value in enumerate((tones.offset[:, 0], tones.offset[:, 1], error)):
-        step[:, column] = inverse @ (orders.T @ (weight * value)) / np.pi
-        covariance[np.ix_([column, column + 3], [column, column + 3])] = (
-            inverse * spread[column] / np.pi**2
-        )
-    return step, covariance, used
+    for column in range(3):
+        covariance[np.ix_([column, column + 3], [column, column + 3])] = inverse * spread[column]
+    window_sum = float(picture.window_u.sum(dtype=float) * picture.window_v.sum(dtype=float))
+    amplitude = 2 * np.abs(tones.transform[used]) / window_sum
+    return ToneLattice(
+        matrix=matrix + step,
+        covariance=covariance,
+        orders=orders,
+        weight=weight,
+        blur_px=_blur(orders, tones.wave[used], amplitude),
+        amplitude=float(np.sqrt(amplitude[0] * amplitude[1])),
+    )
 
 
-def _blur(orders: Array, waves: Array, amplitude: Array) -> float:
+def combine(
+    orders: NDArray[np.int64], weight: Array, phase: Array, wave: Array
+) -> tuple[Array, Array]:
+    """Weighted least squares over tones for a change of the lattice's matrix.
+
+    Tone (n, m) measures the combination n p0 + m q0 of the phases and n grad p + m grad q of
+    the wave vectors. White noise makes the errors of different tones independent, and those of
+    phases and wave vectors too (symmetric window).
+
+    Parameters
+    ----------
+    orders : ndarray of int, shape (n, 2)
+    weight : ndarray, shape (n,)
+    phase : ndarray, shape (n,)
+        Change of the phases, radians.
+    wave : ndarray, shape (n, 2)
+        Change of the wave vectors.
+
+    Returns
+    -------
+    step : ndarray, shape (2, 3)
+    covariance : ndarray, shape (2, 2)
+        Of the last column of `step`, if `weight` is the inverse variance of the phases.
+    """
+    inverse = np.linalg.inv((weight[:, None] * orders).T @ orders)
+    values = np.column_stack([wave, phase])
+    step: Array = inverse @ (orders.T @ (weight[:, None] * values)) / np.pi
+    return step, inverse / np.pi**2
+
+
+def _blur(orders: NDArray[np.int64], waves: Array, amplitude: Array) -> float:
     """Gaussian sigma (pixels) from the fading of the harmonics, NaN with the primaries alone."""
     if len(orders) < 3:
         return float("nan")
