@@ -12,8 +12,6 @@ cumulants, added as derivatives of M (see `rasnik.imaging.model`).
 Pixels are worked on in tiles of TILE x TILE. Every step is a short loop over the pixels of a
 tile without branches, which the compiler turns into vector instructions (longer ones it
 gives up on); the intermediate values are rows of one small array that stays in the cache.
-How many fields a corner feels is passed as the length of a tuple, a constant to the
-compiler, so that its loops are unrolled.
 """
 
 from __future__ import annotations
@@ -60,6 +58,10 @@ M00 = EY + 5 * (2 * MAX_REACH - 1)
 M10, M01, M20, M02, M11 = M00 + 1, M00 + 2, M00 + 3, M00 + 4, M00 + 5
 M31, M13, M22, M40, M04 = M00 + 6, M00 + 7, M00 + 8, M00 + 9, M00 + 10
 DENSITY = M00 + 11
+# orders of the derivatives in the rows from M00 on
+ORDERS = np.array(
+    [[0, 0], [1, 0], [0, 1], [2, 0], [0, 2], [1, 1], [3, 1], [1, 3], [2, 2], [4, 0], [0, 4]]
+)
 SCRATCH = M00 + 12
 WX = SCRATCH + 5
 WY = WX + 5 * 2 * MAX_REACH
@@ -94,8 +96,8 @@ class Scene(NamedTuple):
         Edge profiles along mask X and Y (`rasnik.imaging.profile.EdgeTable`).
     fields : float32, shape (rows, columns)
         1 for white fields; i0, j0 is the index of the first.
-    sides : tuple of int
-        Its length is the number of fields felt at a corner, twice the reach.
+    reach : int
+        Number of fields felt on either side of a corner.
     """
 
     map: NDArray[np.float64]
@@ -113,7 +115,7 @@ class Scene(NamedTuple):
     fields: NDArray[np.float32]
     i0: int
     j0: int
-    sides: tuple[int, ...]
+    reach: int
 
 
 @_compiled
@@ -144,10 +146,9 @@ def locate(work, index, h, u0, v0, pixel, columns, rows):
 
 
 @_compiled
-def profiles(work, index, distance, out, table, limit, step, sides_tag):
+def profiles(work, index, distance, out, table, limit, step, reach):
     """E and four derivatives at every edge within reach: nearest entry plus Taylor."""
-    edges = len(sides_tag) - 1
-    reach = len(sides_tag) // 2
+    edges = 2 * reach - 1
     last = np.float32(table.shape[0] - 1)
     inverse = np.float32(1.0 / step)
     spacing = np.float32(step)
@@ -227,12 +228,11 @@ def one_corner(work, index, flat, width, origin):
 
 
 @_compiled
-def many_corners(work, index, flat, width, origin, sides_tag):
+def many_corners(work, index, flat, width, origin, reach):
     """The same where a pixel feels several corners: sums over the fields within reach."""
-    sides = len(sides_tag)
-    reach = sides // 2
-    weights(work, EX, WX, sides_tag)
-    weights(work, EY, WY, sides_tag)
+    sides = 2 * reach
+    weights(work, EX, WX, reach)
+    weights(work, EY, WY, reach)
     for sy in range(sides):
         for sx in range(sides):
             for lane in range(LANES):
@@ -240,40 +240,29 @@ def many_corners(work, index, flat, width, origin, sides_tag):
                 work[TT + sy * sides + sx, lane] = flat[np.uint32(k)]
     for order in range(5):
         for sy in range(sides):
-            for lane in range(LANES):
-                total = np.float32(0.0)
-                for sx in range(sides):
-                    total += work[TT + sy * sides + sx, lane] * work[WX + order * sides + sx, lane]
-                work[SUMS + order * sides + sy, lane] = total
-    products(work, M00, 0, 0, sides_tag)
-    products(work, M10, 1, 0, sides_tag)
-    products(work, M01, 0, 1, sides_tag)
-    products(work, M20, 2, 0, sides_tag)
-    products(work, M02, 0, 2, sides_tag)
-    products(work, M11, 1, 1, sides_tag)
-    products(work, M31, 3, 1, sides_tag)
-    products(work, M13, 1, 3, sides_tag)
-    products(work, M22, 2, 2, sides_tag)
-    products(work, M40, 4, 0, sides_tag)
-    products(work, M04, 0, 4, sides_tag)
-    edge_densities(work, sides_tag)
+            multiply_add(
+                work, SUMS + order * sides + sy, TT + sy * sides, WX + order * sides, sides
+            )
+    for k in range(len(ORDERS)):
+        of_x, of_y = ORDERS[k]
+        multiply_add(work, M00 + k, SUMS + of_x * sides, WY + of_y * sides, sides)
+    edge_densities(work, reach)
 
 
 @_compiled
-def products(work, out, order_x, order_y, sides_tag):
-    """One derivative of M from the sums along x and the weights along y."""
-    sides = len(sides_tag)
+def multiply_add(work, out, first, second, count):
+    """One row as the sum of `count` products of rows."""
     for lane in range(LANES):
-        total = np.float32(0.0)
-        for sy in range(sides):
-            total += work[SUMS + order_x * sides + sy, lane] * work[WY + order_y * sides + sy, lane]
-        work[out, lane] = total
+        work[out, lane] = work[first, lane] * work[second, lane]
+    for k in range(1, count):
+        for lane in range(LANES):
+            work[out, lane] += work[first + k, lane] * work[second + k, lane]
 
 
 @_compiled
-def weights(work, profile, weight, sides_tag):
+def weights(work, profile, weight, reach):
     """Weights of the fields and their derivatives from the edges between them."""
-    sides = len(sides_tag)
+    sides = 2 * reach
     edges = sides - 1
     for order in range(5):
         first = profile + order * edges
@@ -288,47 +277,41 @@ def weights(work, profile, weight, sides_tag):
 
 
 @_compiled
-def edge_densities(work, sides_tag):
+def edge_densities(work, reach):
     """Length of black-white edge per pixel, folded with the profile's slope.
 
     This is minus the change of M when every black field grows by a small distance.
     """
-    sides = len(sides_tag)
+    sides = 2 * reach
     edges = sides - 1
     for lane in range(LANES):
-        density = np.float32(0.0)
-        for edge in range(edges):
-            across_x = np.float32(0.0)
-            across_y = np.float32(0.0)
-            for side in range(sides):
-                step_x = (
-                    work[TT + side * sides + edge + 1, lane] - work[TT + side * sides + edge, lane]
-                )
-                step_y = (
-                    work[TT + (edge + 1) * sides + side, lane]
-                    - work[TT + edge * sides + side, lane]
-                )
-                across_x += abs(step_x) * work[WY + side, lane]
-                across_y += abs(step_y) * work[WX + side, lane]
-            density += work[EX + edges + edge, lane] * across_x
-            density += work[EY + edges + edge, lane] * across_y
-        work[DENSITY, lane] = density
+        work[DENSITY, lane] = np.float32(0.0)
+    for edge in range(edges):
+        for side in range(sides):
+            here = TT + side * sides + edge
+            for lane in range(LANES):
+                step = abs(work[here + 1, lane] - work[here, lane])
+                work[DENSITY, lane] += step * work[EX + edges + edge, lane] * work[WY + side, lane]
+            here = TT + edge * sides + side
+            for lane in range(LANES):
+                step = abs(work[here + sides, lane] - work[here, lane])
+                work[DENSITY, lane] += step * work[EY + edges + edge, lane] * work[WX + side, lane]
 
 
 @_compiled
 def pattern(work, index, scene, u, v, columns, rows):
     """Blurred mask and derivatives for the tile whose first pixel is at sensor point (u, v)."""
-    sides = scene.sides
+    reach = scene.reach
     locate(work, index, scene.map, u, v, scene.pixel_um, columns, rows)
-    profiles(work, index, DX, EX, scene.table_x, scene.limit_x, scene.step_x, sides)
-    profiles(work, index, DY, EY, scene.table_y, scene.limit_y, scene.step_y, sides)
+    profiles(work, index, DX, EX, scene.table_x, scene.limit_x, scene.step_x, reach)
+    profiles(work, index, DY, EY, scene.table_y, scene.limit_y, scene.step_y, reach)
     flat = scene.fields.ravel()
     width = np.int32(scene.fields.shape[1])
     origin = np.int32(scene.j0 * scene.fields.shape[1] + scene.i0)
-    if len(sides) == 2:
+    if reach == 1:
         one_corner(work, index, flat, width, origin)
     else:
-        many_corners(work, index, flat, width, origin, sides)
+        many_corners(work, index, flat, width, origin, reach)
 
 
 @_compiled
