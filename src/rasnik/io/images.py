@@ -192,7 +192,8 @@ def _frame(source: Source, index: int, image: NDArray[Any], notes: tuple[str, ..
 def _error_frame(source: Source, index: int, error: Exception | str) -> Frame:
     if isinstance(error, Exception) and not isinstance(error, ImageFileError):
         error = _decoder_failure(source.path, error)
-    return Frame(source.name, index, error=_sentence(source.name, str(error)))
+    name = f"{source.name}[{index}]" if index else source.name
+    return Frame(source.name, index, error=_sentence(name, str(error)))
 
 
 def _frames_of(source: Source) -> Iterator[Frame]:

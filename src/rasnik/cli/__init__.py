@@ -1,0 +1,48 @@
+"""The command ``rasnik``: one module for each of its commands."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from rasnik.cli.analyse import analyse_command
+from rasnik.cli.demo import demo_command
+from rasnik.cli.simulate import simulate_command
+from rasnik.cli.systems import systems_command
+
+__all__ = ["app"]
+
+app = typer.Typer(
+    name="rasnik",
+    help="Where a coded mask stands, from images of it.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from rasnik import __version__
+
+        typer.echo(f"rasnik {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _main(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version."),
+    ] = False,
+) -> None:
+    pass
+
+
+app.command("analyse")(analyse_command)
+app.command("simulate")(simulate_command)
+app.command("systems")(systems_command)
+app.command("demo")(demo_command)

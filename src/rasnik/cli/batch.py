@@ -1,0 +1,311 @@
+"""The loop of ``rasnik analyse``: frame by frame to poses, and where they go."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from rich.markup import escape
+
+from rasnik.cli.common import fail, messages, output
+from rasnik.io.images import Frame, Source, count_frames, expand_paths, iter_frames
+
+if TYPE_CHECKING:
+    from rasnik.analysis.pose import Pose
+    from rasnik.instrument import System
+    from rasnik.io.results import ResultWriter
+
+_COLUMNS = ("x (µm)", "y (µm)", "theta (mrad)", "S", "or.", "chi2/ndf")
+_WIDE = 110  # characters that all columns need; the last two are left out with fewer
+
+__all__ = ["Destination", "Options", "run_batch"]
+
+_COUNTED_SOURCES = 200  # with more, opening each only to count its frames takes too long
+
+
+@dataclass(frozen=True)
+class Options:
+    """How images are analysed: the instrument or the two sizes, and what `analyse` takes."""
+
+    system: System | None
+    field_um: float | None
+    pixel_um: float | None
+    method: Literal["likelihood", "fourier"]
+    model: Literal["auto", "similarity", "affine", "projective"]
+    orientation: int | None
+    bounds: tuple[int, int, int, int] | None
+
+
+@dataclass(frozen=True)
+class Destination:
+    """Where results go: a table on the terminal unless something else is asked for."""
+
+    json: bool = False
+    csv: bool = False
+    file: Path | None = None
+    overlays: Path | None = None
+
+
+@dataclass
+class _Outcome:
+    """What the loop has seen so far."""
+
+    good: int = 0
+    failed: int = 0
+    errors: list[str] = field(default_factory=list)
+    rows: list[tuple[Frame, Pose | None, str | None]] = field(default_factory=list)
+
+
+def run_batch(images: list[str], options: Options, destination: Destination) -> bool:
+    """Analyse every frame of the images named; True if each gave a position.
+
+    A frame that fails is a result as well: it is written with its error, and the others
+    follow.
+    """
+    sources = expand_paths(images)
+    if all(source.error for source in sources):
+        fail(f"there are no images: {'; '.join(f'{s.name}: {s.error}' for s in sources)}.")
+    logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # faults come out as errors
+    outcome = _Outcome()
+    as_table = not (destination.json or destination.csv or destination.file)
+    with ExitStack() as opened:
+        writer = _open_writer(opened, destination, options, sources)
+        overlays = _Overlays(destination.overlays, options) if destination.overlays else None
+        advance = opened.enter_context(_progress(sources))
+        for frame in iter_frames(sources):
+            pose, error = _analyse(frame, options)
+            outcome.good += error is None
+            outcome.failed += error is not None
+            if error is not None:
+                outcome.errors.append(error)
+            if writer is not None:
+                _write(writer, destination, frame, pose, error)
+            if as_table:
+                outcome.rows.append((frame, pose, error))
+            if overlays is not None and pose is not None:
+                overlays.draw(frame, pose)
+            advance()
+    _report(outcome, destination, as_table)
+    return outcome.failed == 0
+
+
+def _analyse(frame: Frame, options: Options) -> tuple[Pose | None, str | None]:
+    """Pose of a frame, and the sentence that says why there is no position."""
+    from rasnik.analysis.analyse import analyse
+
+    name = f"{frame.file}[{frame.frame}]" if frame.frame else frame.file
+    if frame.image is None:
+        return None, frame.error
+    try:
+        pose = analyse(
+            frame.image,
+            options.system,
+            field_um=options.field_um,
+            pixel_um=options.pixel_um,
+            method=options.method,
+            model=options.model,
+            orientation=options.orientation,
+            bounds=frame.clip_bounds(options.bounds),
+        )
+    except ValueError as error:
+        return None, f"{name}: {str(error).rstrip('.')}."
+    except Exception as error:  # a fault of ours in one frame must not lose the others
+        kind = type(error).__name__
+        return None, f"{name}: unexpected {kind} ({error}); please report it."
+    return pose, None if pose.ok else f"{name}: {pose.error}"
+
+
+# ------------------------------------------------------------------------ where results go
+
+
+def _open_writer(
+    opened: ExitStack, destination: Destination, options: Options, sources: list[Source]
+) -> ResultWriter | None:
+    from rasnik.io.results import CsvWriter, JsonLinesWriter, open_results
+
+    if destination.json:
+        return JsonLinesWriter(sys.stdout)
+    if destination.csv:
+        return CsvWriter(sys.stdout)
+    if destination.file is None:
+        return None
+    path = destination.file
+    if any(source.path.exists() and _same_file(source.path, path) for source in sources):
+        fail(f"{path} is one of the images and would be overwritten; name another file.")
+    if not path.parent.is_dir():
+        fail(f"{path} cannot be written: there is no folder {path.parent}.")
+    try:
+        return opened.enter_context(open_results(path, system=options.system))
+    except (ValueError, ImportError, FileExistsError) as error:
+        fail(f"{error}.")
+    except OSError as error:
+        fail(f"{path} cannot be written: {error.strerror or error}.")
+
+
+def _same_file(one: Path, other: Path) -> bool:
+    return other.exists() and os.path.samefile(one, other)
+
+
+def _write(
+    writer: ResultWriter,
+    destination: Destination,
+    frame: Frame,
+    pose: Pose | None,
+    error: str | None,
+) -> None:
+    from rasnik.io.columns import make_record
+
+    own_error = None if pose is not None else error
+    record = make_record(frame.file, frame.frame, pose, error=own_error, notes=frame.notes)
+    try:
+        writer.write(record)
+    except BrokenPipeError:  # whoever read the output has seen enough
+        raise
+    except OSError as fault:
+        fail(f"{destination.file or 'the output'} cannot be written: {fault.strerror or fault}.")
+
+
+class _Overlays:
+    """Draws overlays into a folder, each under a name of its own."""
+
+    def __init__(self, folder: Path, options: Options) -> None:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            fail(f"the folder {folder} for overlays cannot be made: {error.strerror}.")
+        self._folder, self._options = folder, options
+        self._used: set[str] = set()
+
+    def draw(self, frame: Frame, pose: Pose) -> None:
+        from rasnik.report.overlay import draw_overlay
+
+        assert frame.image is not None
+        system = self._options.system or _system_of(frame, self._options)
+        title = f"{frame.file}, frame {frame.frame}"
+        try:
+            draw_overlay(
+                frame.image,
+                pose,
+                system,
+                self._path(frame),
+                bounds_px=frame.clip_bounds(self._options.bounds),
+                title=title,
+            )
+        except OSError as error:
+            fail(f"an overlay cannot be written to {self._folder}: {error.strerror}.")
+
+    def _path(self, frame: Frame) -> Path:
+        stem = Path(frame.file).stem
+        name = f"{stem}_overlay" if frame.frame == 0 else f"{stem}_{frame.frame:05d}_overlay"
+        unique, number = name, 2
+        while unique in self._used:
+            unique, number = f"{name}_{number}", number + 1
+        self._used.add(unique)
+        return self._folder / f"{unique}.png"
+
+
+def _system_of(frame: Frame, options: Options) -> System:
+    """A system with the image's own size, for field and pixel sizes alone."""
+    from rasnik.instrument import Optics, Sensor, System
+    from rasnik.mask import ChessField
+
+    assert frame.image is not None
+    assert options.field_um is not None
+    assert options.pixel_um is not None
+    height, width = frame.image.shape
+    return System(
+        name="image",
+        mask=ChessField(field_um=options.field_um),
+        optics=Optics(scale=1.0, blur_um=0.0),
+        sensor=Sensor(
+            width_px=width,
+            height_px=height,
+            pixel_um=options.pixel_um,
+            dark_level=0.0,
+            light_level=255.0,
+        ),
+    )
+
+
+# ------------------------------------------------------------------------ the terminal
+
+
+@contextmanager
+def _progress(sources: list[Source]) -> Iterator[Callable[[], None]]:
+    """Something to call after each frame; a bar if somebody is looking."""
+    console = messages()
+    if not console.is_terminal:
+        yield lambda: None
+        return
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
+
+    few = len(sources) <= _COUNTED_SOURCES
+    total = sum(count_frames(source) for source in sources) if few else len(sources)
+    columns = ("analysing", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("", total=total)
+        yield lambda: bar.advance(task)
+
+
+def _report(outcome: _Outcome, destination: Destination, as_table: bool) -> None:
+    if as_table:
+        _print_table(outcome.rows)
+    console = messages()
+    for error in outcome.errors:
+        console.print(f"[red]{escape(error)}[/]")
+    total = outcome.good + outcome.failed
+    summary = f"{total} image{'s' * (total != 1)}: {outcome.good} with a position"
+    if outcome.failed:
+        summary += f", {outcome.failed} without"
+    if destination.file is not None:
+        summary += f"; results in {destination.file}"
+    if destination.overlays is not None:
+        summary += f"; overlays in {destination.overlays}"
+    (output() if as_table else console).print(escape(summary))
+
+
+def _print_table(rows: list[tuple[Frame, Pose | None, str | None]]) -> None:
+    from rich.table import Table
+
+    console = output()
+    headings = list(_COLUMNS if console.width >= _WIDE else _COLUMNS[:-2])
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("image", overflow="fold")
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("remarks", overflow="fold")
+    stacks = {frame.file for frame, _, _ in rows if frame.frame > 0}
+    for frame, pose, error in rows:
+        name = f"{frame.file}[{frame.frame}]" if frame.file in stacks else frame.file
+        cells = _cells(pose)[: len(headings)]
+        table.add_row(escape(name), *cells, escape(_remarks(frame, pose, error)))
+    console.print(table)
+    if any(pose is not None and pose.ok for _, pose, _ in rows):
+        console.print("(in parentheses: one standard deviation, in units of the last digit)")
+
+
+def _cells(pose: Pose | None) -> list[str]:
+    from rasnik.report.numbers import concise
+
+    if pose is None or not pose.ok:
+        return ["-"] * len(_COLUMNS)
+    return [
+        concise(pose.x_um, pose.sigma_x_um),
+        concise(pose.y_um, pose.sigma_y_um),
+        concise(1e3 * pose.theta_rad, 1e3 * pose.sigma_theta_rad),
+        concise(pose.scale, pose.sigma_scale),
+        str(pose.orientation),
+        f"{pose.chi2_ndf:.3f}",
+    ]
+
+
+def _remarks(frame: Frame, pose: Pose | None, error: str | None) -> str:
+    words: list[Any] = [] if error is None else ["FAILED"]
+    words += pose.flags.names if pose is not None else ["see below"]
+    return ", ".join([*words, *frame.notes])

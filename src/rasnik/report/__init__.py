@@ -1,0 +1,1 @@
+"""Results for the eye: numbers with their errors, overlays, the demonstration."""
