@@ -224,7 +224,8 @@ def test_series_equals_its_direct_sum():
     wave_x = np.exp(2j * np.pi * k * x[..., None]) * np.where(k == 0, 1, 2)
     wave_y = np.exp(2j * np.pi * m * y[..., None])
     direct = np.einsum("rcm,mk,rck->rc", wave_y, c, wave_x).real
-    assert abs(image - direct).max() < 1e-8 * abs(direct).max()
+    # A flat spectrum is the hardest for the interpolation.
+    assert abs(image - direct).max() < 5e-8 * abs(direct).max()
 
 
 def test_series_refuses_points_outside_the_period():

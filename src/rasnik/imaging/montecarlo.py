@@ -50,7 +50,7 @@ _CACHED_POINTS = 2**20
 # map; the blur of a tile is that of its middle.
 _TILE_CHANGE = 4e-4
 # Transferred detail up to which the work stays bearable: a blur of 1/20 pixel.
-_MAX_CYCLES_PER_PIXEL = 18.1
+_MAX_CYCLES_PER_PIXEL = 16.8
 _SPLITS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 
 
@@ -319,22 +319,25 @@ class _Scene:
         (a, b), (c, d) = window.jacobian * self.pitch_um
         u_x, v_x = a * k / x.length_um, b * k / x.length_um
         u_y, v_y = c * m / y.length_um, d * m / y.length_um
-        coefficients *= self.transfer(
-            (u_x + u_y[:, None]) / self.pitch_um, (v_x + v_y[:, None]) / self.pitch_um
+        pixel = _sinc_of_sum(u_x, u_y)
+        pixel *= _sinc_of_sum(v_x, v_y)
+        p = self.pitch_um
+        coefficients *= (
+            self.transfer(u_x / p + u_y[:, None] / p, v_x / p + v_y[:, None] / p) * pixel
         )
-        coefficients *= _sinc_of_sum(u_x, u_y)
-        coefficients *= _sinc_of_sum(v_x, v_y)
         return np.asarray(coefficients)
 
 
 def _sinc_of_sum(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
     """sinc(x + y), shape (y.size, x.size), with sines of the one-dimensional parts only."""
-    total = np.pi * (x + y[:, None])
-    total[np.abs(total) < 1e-7] = 1e-7  # where sinc is 1 to rounding error
-    sine = np.sin(np.pi * x) * np.cos(np.pi * y)[:, None]
-    sine += np.cos(np.pi * x) * np.sin(np.pi * y)[:, None]
+    x, y = np.pi * x, np.pi * y[:, None]
+    total = x + y
+    sine = np.sin(x) * np.cos(y)
+    sine += np.cos(x) * np.sin(y)
+    zero = np.abs(total) < 1e-7  # where sinc is 1 to rounding error
+    sine[zero] = total[zero] = 1.0
     sine /= total
-    return np.where(np.abs(total) <= 1e-7, 1.0, sine)
+    return sine
 
 
 def _local_jacobian(projection: Projection, u: float, v: float) -> NDArray[np.float64]:

@@ -3,7 +3,8 @@
 The series is summed on a regular grid about a third finer than needed, by fast Fourier transform;
 the value between the grid points follows by interpolation with a Kaiser-Bessel kernel, whose
 own transform has been divided out of the coefficients beforehand. With `WIDTH` points per
-axis the result differs from the sum of the series by some 1e-9 of its largest swing.
+axis the result differs from the sum of the series by less than 5e-8 of its largest swing, even
+if the highest harmonics are as strong as the lowest.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ from numpy.typing import NDArray
 __all__ = ["GUARD", "OVERSAMPLING", "WIDTH", "evaluate_series", "grid_lengths", "kernel_transform"]
 
 #: Grid points per axis that contribute to a value.
-WIDTH = 12
+WIDTH = 10
 #: Fine grid points per harmonic, at least.
-OVERSAMPLING = 1.35
+OVERSAMPLING = 1.4
 #: Distance in grid points that evaluated points must keep from the ends of the period.
 GUARD = WIDTH // 2 + 1
 
 # Shape parameter: the transform of the kernel has its first zero where the first alias of
 # the highest harmonic begins.
 _BETA = np.pi * np.sqrt((WIDTH * (1 - 0.5 / OVERSAMPLING)) ** 2 - 0.8)
-_DEGREE = 15
+_DEGREE = 13
 
 
 def grid_lengths(highest: tuple[int, int]) -> tuple[int, int]:

@@ -315,9 +315,12 @@ def _is_one_pose(poses: Any) -> bool:
 
 def _truth(system: System, pose: Any, label: str) -> Truth:
     """The pose in full; `label` names it in messages."""
-    if isinstance(pose, Projection):
-        scale, theta_rad, orientation = pose.similarity()
-        truth = Truth(pose.x_um, pose.y_um, scale, theta_rad, orientation, pose)
+    # A `Truth` and an analysed pose may hold more than a similarity.
+    projection = pose if isinstance(pose, Projection) else getattr(pose, "projection", None)
+    if isinstance(projection, Projection):
+        known = getattr(pose, "orientation", None) or None
+        x_um, y_um = projection.x_um, projection.y_um
+        truth = Truth(x_um, y_um, *projection.similarity(known), projection)
     else:
         truth = _similarity_truth(system, _pose_values(pose, label), label)
     x0, x1, y0, y1 = system.mask.bounds_um

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 __all__ = ["GaussianTransfer", "OpticalTransfer"]
 
-# Where a Gaussian is cut: above CUTOFF_SIGMA / sigma its transfer is below 1e-7; beyond
-# REACH_SIGMA * sigma lies less than 4e-8 of the light that crosses an edge.
-CUTOFF_SIGMA = np.sqrt(np.log(1e7) / 2) / np.pi
-REACH_SIGMA = 5.5
+# Where a Gaussian is cut: above CUTOFF_SIGMA / sigma its transfer is below 1e-6, which
+# leaves an error of some 1e-8 of the step at an edge; at REACH_SIGMA * sigma from a straight
+# edge its blur has faded to 4e-8 of the step.
+CUTOFF_SIGMA = np.sqrt(np.log(1e6) / 2) / np.pi
+REACH_SIGMA = 5.4
 
 
 class OpticalTransfer(Protocol):
