@@ -73,6 +73,21 @@ def _full_scale(image: NDArray[np.generic], system: System | None) -> float | No
     return None
 
 
+def _leave_out_saturated(at_top: NDArray[np.bool_], valid: NDArray[np.uint8]) -> bool:
+    """Mark saturated patches as not valid; returns whether much of the image is at the top.
+
+    Single pixels reach the top by noise; 3 x 3 of them are a glint or overexposed.
+    """
+    count = np.count_nonzero(at_top)
+    if count < 9:
+        return False
+    row = at_top[:, :-2] & at_top[:, 1:-1] & at_top[:, 2:]
+    patch = row[:-2] & row[1:-1] & row[2:]
+    if patch.any():
+        valid[ndimage.binary_dilation(np.pad(patch, 1), np.ones((3, 3)), iterations=2)] = 0
+    return bool(count > _SATURATED_FRACTION * at_top.size)
+
+
 def prepare_frame(
     image: NDArray[np.generic],
     mask: ChessField,
@@ -124,15 +139,8 @@ def prepare_frame(
             valid[~finite] = 0
             grey = np.where(finite, grey, np.float32(0.0))
     full = _full_scale(array, system)
-    if full is not None:
-        at_top = (grey >= full) & (valid > 0)
-        fraction = np.count_nonzero(at_top) / max(np.count_nonzero(valid), 1)
-        if fraction > _SATURATED_FRACTION:
-            flags |= Flag.SATURATED
-        if fraction > 1e-4:
-            # single pixels reach the top by noise; whole patches are glints or overexposed
-            patch = ndimage.minimum_filter(at_top, 3)
-            valid[ndimage.binary_dilation(patch, iterations=2)] = 0
+    if full is not None and _leave_out_saturated(grey >= full, valid):
+        flags |= Flag.SATURATED
     noise = None if system is None else system.noise_law
     if noise is not None and np.issubdtype(array.dtype, np.integer):
         noise = (noise[0] + _ROUNDING_VARIANCE, noise[1])

@@ -270,11 +270,12 @@ def _iterate(
         damping = 1.0
         best_start = state
         state = stepped(state, fraction * step, model, min_blur, kurtosis)
-        small = fraction == 1.0 and _is_last(best_start, step, model, frame)
+        still = _motion_fields(best_start, step, frame) < LAST_STEP_FIELDS
         best = _Solution(
-            state, rows, normal, fraction * step, moments, moments.chi2 - gradient @ step, small
+            state, rows, normal, fraction * step, moments, moments.chi2 - gradient @ step, still
         )
-        if small:
+        variance = best_start.appearance.blur_um**2
+        if still and abs(step[POSE_SIZE[model] + 12]) < 0.02 * variance:
             break
     assert best is not None
     return best
@@ -307,14 +308,6 @@ def _motion_fields(state: State, step: NDArray[np.float64], frame: Frame) -> flo
     return float((np.hypot(*step[:2]) + reach * turn) / frame.mask.field_um)
 
 
-def _is_last(state: State, step: NDArray[np.float64], model: Model, frame: Frame) -> bool:
-    variance = state.appearance.blur_um**2
-    return (
-        _motion_fields(state, step, frame) < LAST_STEP_FIELDS
-        and abs(step[POSE_SIZE[model] + 12]) < 0.02 * variance
-    )
-
-
 def _shears_needed(solution: _Solution) -> bool:
     """Whether the affine fit differs from a similarity by more than it can by chance."""
     inverse = _inverse(solution.normal)[4:6, 4:6] * max(1.0, solution.chi2_ndf)
@@ -325,11 +318,11 @@ def _shears_needed(solution: _Solution) -> bool:
 
 
 def _is_clean(solution: _Solution) -> bool:
-    """No tile's chi-square stands out: 6 sigma, relative to the median tile."""
+    """No tile's chi-square stands out: 6 sigma above the noise, or above the median tile."""
     counts = solution.moments.counts
     full = counts >= 32
     ratio = solution.moments.chi2_per_tile[full] / counts[full]
-    limit = np.median(ratio) * (1 + 6 * np.sqrt(2 / counts[full]))
+    limit = max(1.0, float(np.median(ratio))) * (1 + 6 * np.sqrt(2 / counts[full]))
     return bool((ratio < limit).all())
 
 
@@ -370,7 +363,10 @@ def _add_what_is_needed(
         if not kurtosis:
             options.append((chosen, True))
         gains = [_gain(frame, solution, *option) for option in options]
-        if not gains or max(gains) < DEMANDED_GAIN * max(1.0, solution.chi2_ndf):
+        # dirt and distortion make chi-square fall for no reason; not more than they scatter
+        growth = _scatter_growth(solution, _inverse(solution.normal), frame.camera)
+        inflation = max(1.0, solution.chi2_ndf, float((growth**2).max()))
+        if not gains or max(gains) < DEMANDED_GAIN * inflation:
             break
         chosen, kurtosis = options[int(np.argmax(gains))]
         solution = _iterate(frame, noise, solution.state, chosen, kurtosis, tiles, 6)
@@ -395,22 +391,34 @@ def _pose_covariance(solution: _Solution, enlarge: bool, camera: Camera) -> NDAr
     inverse = _inverse(solution.normal)
     covariance = inverse[:4, :4].copy()
     if enlarge:
-        covariance *= max(1.0, solution.chi2_ndf)
-        tiles = all_tiles(camera.shape)
-        cluster = tiles // _CLUSTER_TILES
-        label = cluster[:, 0] * (cluster[:, 1].max() + 1) + cluster[:, 1]
-        per_tile = solution.moments.per_tile @ solution.design.T
-        # residuals after the last step
-        per_tile -= per_tile.mean(axis=0)
-        sums = np.zeros((label.max() + 1, per_tile.shape[1]))
-        np.add.at(sums, label, per_tile)
-        scatter = (inverse @ (sums.T @ sums) @ inverse)[:4, :4]
-        growth = np.sqrt(np.maximum(1.0, np.diag(scatter) / np.diag(covariance)))
+        growth = np.maximum(
+            np.sqrt(max(1.0, solution.chi2_ndf)), _scatter_growth(solution, inverse, camera)
+        )
         covariance *= np.outer(growth, growth)
     scale = solution.state.projection.similarity()[0]
     unit = np.diag([1.0, 1.0, scale, 1.0])
     result: NDArray[np.float64] = unit @ covariance @ unit
     return result
+
+
+def _scatter_growth(
+    solution: _Solution, inverse: NDArray[np.float64], camera: Camera
+) -> NDArray[np.float64]:
+    """Scatter of the pose between clusters of tiles, relative to what the noise explains.
+
+    Returns
+    -------
+    ndarray, shape (4,)
+    """
+    cluster = all_tiles(camera.shape) // _CLUSTER_TILES
+    label = cluster[:, 0] * (cluster[:, 1].max() + 1) + cluster[:, 1]
+    gradient = solution.moments.per_tile @ solution.design.T
+    gradient -= gradient.mean(axis=0)
+    sums = np.zeros((label.max() + 1, gradient.shape[1]))
+    np.add.at(sums, label, gradient)
+    scatter = (inverse @ (sums.T @ sums) @ inverse)[:4, :4]
+    growth: NDArray[np.float64] = np.sqrt(np.diag(scatter) / np.diag(inverse)[:4])
+    return growth
 
 
 def _explained(frame: Frame, noise: tuple[float, float], chi2_ndf: float) -> float:

@@ -38,6 +38,9 @@ Model = Literal["similarity", "affine", "projective"]
 #: Number of pose parameters: x, y, ln S, theta_z; two shears; two tilts.
 POSE_SIZE: dict[Model, int] = {"similarity": 4, "affine": 6, "projective": 8}
 
+#: Beyond this excess kurtosis the profile would not be one edge any more.
+KURTOSIS_RANGE = (-0.8, 2.4)
+
 _ONE, _U, _V, _UU, _UV, _VV = range(N_MONOMIALS)
 _N_SIGNALS = 7
 _TURN = np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -101,7 +104,7 @@ def stepped(
 ) -> State:
     """The state after a step in the parameters of `design`.
 
-    The blur changes by at most a factor of 1.5 in sigma; excess kurtosis stays in -1.2..6.
+    The blur changes by at most a factor of 1.5 in sigma; the excess kurtosis stays in `KURTOSIS_RANGE`.
     """
     n_pose = POSE_SIZE[model]
     projection = _moved(state.projection, step[:n_pose])
@@ -112,7 +115,7 @@ def stepped(
     blur = max(blur, min_blur_um)
     excess = old.kurtosis * (old.blur_um / blur) ** 4
     if kurtosis:
-        excess = float(np.clip(excess + rest[14] / blur**4, -1.2, 6.0))
+        excess = float(np.clip(excess + rest[14] / blur**4, *KURTOSIS_RANGE))
     appearance = Appearance(
         dark=old.dark + rest[:6],
         light=old.light + rest[6:12],
