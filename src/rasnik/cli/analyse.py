@@ -14,6 +14,7 @@ __all__ = ["Method", "Model", "analyse_command"]
 
 _INSTRUMENT, _ANALYSIS, _OUTPUT = "Instrument", "Analysis", "Output"
 _ORIENTATIONS = {"auto": None, "1": 1, "2": 2, "3": 3, "4": 4}
+_SIZES_UM = {"--field-um": (0.01, 1e6), "--pixel-um": (0.1, 1e3)}
 
 
 class Method(StrEnum):
@@ -144,6 +145,8 @@ def analyse_command(
     if orientation not in _ORIENTATIONS:
         fail(f"--orientation {orientation!r} is not known; give auto, 1, 2, 3 or 4.")
     _check_instrument(system, settings, field_um, pixel_um)
+    if method is Method.FOURIER and model not in (Model.AUTO, Model.SIMILARITY):
+        fail(f"--method fourier knows only the similarity; leave out --model {model.value}.")
     edges = _parse_bounds(bounds) if bounds is not None else None
     instrument = load(system, settings or ()) if system is not None else None
 
@@ -184,8 +187,9 @@ def _check_instrument(
             else f"{missing[0]} is missing; it goes with {given[0]}."
         )
     for name, value in sizes.items():
-        if value is not None and not 0 < value < float("inf"):
-            fail(f"{name} must be a positive number of um, not {value:g}.")
+        least, most = _SIZES_UM[name]
+        if value is not None and not least <= value <= most:
+            fail(f"{name} must be between {least:g} and {most:g} um, not {value:g}.")
 
 
 def _parse_bounds(text: str) -> tuple[int, int, int, int]:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rasnik.io.results import ResultWriter
 
 _COLUMNS = ("x (µm)", "y (µm)", "theta (mrad)", "S", "or.", "chi2/ndf")
+_MOST_CANDIDATES = 4
 _WIDE = 110  # characters that all columns need; the last two are left out with fewer
 
 __all__ = ["Destination", "Options", "run_batch"]
@@ -59,6 +60,7 @@ class _Outcome:
     good: int = 0
     failed: int = 0
     errors: list[str] = field(default_factory=list)
+    """Sentences, with the candidates of ambiguous images."""
     rows: list[tuple[Frame, Pose | None, str | None]] = field(default_factory=list)
 
 
@@ -83,7 +85,7 @@ def run_batch(images: list[str], options: Options, destination: Destination) -> 
             outcome.good += error is None
             outcome.failed += error is not None
             if error is not None:
-                outcome.errors.append(error)
+                outcome.errors += [error, *_candidates(pose)]
             if writer is not None:
                 _write(writer, destination, frame, pose, error)
             if as_table:
@@ -119,6 +121,20 @@ def _analyse(frame: Frame, options: Options) -> tuple[Pose | None, str | None]:
         kind = type(error).__name__
         return None, f"{name}: unexpected {kind} ({error}); please report it."
     return pose, None if pose.ok else f"{name}: {pose.error}"
+
+
+def _candidates(pose: Pose | None) -> list[str]:
+    """Lines on the poses between which an image does not decide."""
+    if pose is None:
+        return []
+    listed = pose.candidates[:_MOST_CANDIDATES]
+    lines = [
+        f"  candidate: x = {c.x_um:.3f} µm, y = {c.y_um:.3f} µm, theta = "
+        f"{1e3 * c.theta_rad:.4f} mrad, orientation {c.orientation}, log-odds {c.log_odds:.1f}"
+        for c in listed
+    ]
+    more = len(pose.candidates) - len(listed)
+    return [*lines, f"  and {more} more; --json lists all"] if more else lines
 
 
 # ------------------------------------------------------------------------ where results go
@@ -199,6 +215,9 @@ class _Overlays:
             )
         except OSError as error:
             fail(f"an overlay cannot be written to {self._folder}: {error.strerror}.")
+        except Exception as error:  # a picture that fails must not end the measurement
+            text = f"{title}: the overlay cannot be drawn ({type(error).__name__}: {error})."
+            messages().print(escape(text))
 
     def _path(self, frame: Frame) -> Path:
         stem = Path(frame.file).stem

@@ -6,6 +6,7 @@ Uses matplotlib's figures directly, not its pyplot state, so it is safe in threa
 from __future__ import annotations
 
 import os
+import textwrap
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,8 +33,11 @@ Image = NDArray[Any]
 MOST_FIELDS = 80
 #: No more code numbers along one side than this.
 MOST_LABELS = 30
+#: No more candidates of an ambiguous image in the caption than this.
+MOST_CANDIDATES = 4
 COLUMN_COLOUR, ROW_COLOUR, LATTICE_COLOUR = "#ff9d2e", "#39b6ff", "#5fd35f"
 _DPI = 110
+_CAPTION_LETTERS = 105  # in a line over one panel
 _POINTS = 400  # along a line, to find where it enters the image
 
 
@@ -156,6 +160,47 @@ def _draw_contours(axes: Axes, view: _View) -> None:
         axes.plot(*view.to_pixel([i0, i1], [j, j]), **style)
 
 
+class _Sheet:
+    """A figure with panels side by side, each above its colour bar, and a caption on top.
+
+    Everything is placed in inches: matplotlib's automatic layouts draw the figure twice.
+    """
+
+    _PANEL, _LEFT, _RIGHT, _BOTTOM, _TOP, _LINE = 8.0, 0.75, 0.85, 1.35, 0.75, 0.19
+
+    def __init__(self, panels: int, shape: tuple[int, ...], caption: str) -> None:
+        lines = [
+            part
+            for line in caption.splitlines()
+            for part in textwrap.wrap(line, panels * _CAPTION_LETTERS) or [""]
+        ]
+        self._width = self._PANEL - self._LEFT - self._RIGHT
+        self._height = self._width * min(max(shape[0] / shape[1], 0.3), 2.0)
+        total = self._BOTTOM + self._height + self._TOP + 0.2 + self._LINE * len(lines)
+        self._size = panels * self._PANEL, total
+        self.figure = Figure(figsize=self._size, dpi=_DPI)
+        FigureCanvasAgg(self.figure)
+        self.figure.suptitle(
+            "\n".join(lines), x=0.12 / self._size[0], y=1 - 0.1 / total, ha="left", fontsize=10
+        )
+
+    def _axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        across, up = self._size
+        return self.figure.add_axes((left / across, bottom / up, width / across, height / up))
+
+    def panel(self, number: int) -> Axes:
+        """Axes of an image, from the left."""
+        left = number * self._PANEL + self._LEFT
+        return self._axes(left, self._BOTTOM, self._width, self._height)
+
+    def colour_bar(self, number: int, shown: Any, label: str, **options: Any) -> None:
+        """The scale under a panel."""
+        left = number * self._PANEL + self._LEFT + 0.15 * self._width
+        axes = self._axes(left, 0.55, 0.7 * self._width, 0.16)
+        bar = self.figure.colorbar(shown, cax=axes, orientation="horizontal", **options)
+        bar.set_label(label)
+
+
 def _show(axes: Axes, pixels: Image, pitch_um: float, **options: Any) -> Any:
     """An image with pixels on the lower and left axes, micrometres on the others."""
     height, width = pixels.shape
@@ -186,16 +231,33 @@ def _grey_range(image: Image) -> tuple[float, float]:
     return (low, high) if high > low else (low - 0.5, low + 0.5)
 
 
-def _draw_residuals(figure: Figure, axes: Axes, residuals: Image, pitch_um: float) -> None:
+def _draw_image(sheet: _Sheet, image: Image, pose: Pose, system: System) -> None:
+    """The image with the lattice that was found, and the reference point."""
+    axes, pitch_um = sheet.panel(0), system.pitch_um
+    low, high = _grey_range(image)
+    shown = _show(axes, image, pitch_um, cmap="gray", vmin=low, vmax=high)
+    sheet.colour_bar(0, shown, "grey level")
+    if pose.ok and pose.projection is not None:
+        view = _View(pose.projection, system.mask, image.shape, pitch_um)
+        _draw_contours(axes, view)
+        _draw_code_lines(axes, view)
+    centre = (image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2
+    stroke = [patheffects.withStroke(linewidth=3.5, foreground="black")]
+    axes.plot(*centre, "+", ms=16, mew=1.8, color="#ff4dff", path_effects=stroke)
+    lattice = "Fitted lattice, code columns (orange) and rows (blue), pivots, " if pose.ok else ""
+    axes.set_title(f"{lattice}reference point (+)", fontsize=10)
+
+
+def _draw_residuals(sheet: _Sheet, residuals: Image, pitch_um: float) -> None:
     """Image minus model; NaN (pixels left out) in yellow."""
+    axes = sheet.panel(1)
     seen = residuals[np.isfinite(residuals)]
     spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen)))) if seen.size else 0.0
     limit = 5 * spread if spread > 0 else 1.0
-    masked = np.ma.masked_invalid(residuals)
     colours = colormaps["RdBu_r"].with_extremes(bad="#ffe14d")
+    masked = np.ma.masked_invalid(residuals)
     shown = _show(axes, masked, pitch_um, cmap=colours, vmin=-limit, vmax=limit)
-    bar = figure.colorbar(shown, ax=axes, location="bottom", shrink=0.7, pad=0.02, extend="both")
-    bar.set_label("image - model (grey levels)")
+    sheet.colour_bar(1, shown, "image - model (grey levels)", extend="both")
     left_out = 1 - seen.size / residuals.size
     title = "Residuals" + (f"; yellow: left out ({100 * left_out:.1f} %)" if left_out else "")
     axes.set_title(title, fontsize=10)
@@ -204,12 +266,14 @@ def _draw_residuals(figure: Figure, axes: Axes, residuals: Image, pitch_um: floa
 def _caption(pose: Pose) -> str:
     if not pose.ok:
         lines = [f"No position. {pose.error}"]
-        for c in pose.candidates:
+        for c in pose.candidates[:MOST_CANDIDATES]:
             lines.append(
-                f"candidate: x = {c.x_um:.3f} µm, y = {c.y_um:.3f} µm, S = {c.scale:.5f}, "
-                f"theta = {1e3 * c.theta_rad:.3f} mrad, orientation {c.orientation}, "
+                f"candidate: x = {c.x_um:.3f}, y = {c.y_um:.3f} µm, theta = "
+                f"{1e3 * c.theta_rad:.3f} mrad, orientation {c.orientation}, "
                 f"log-odds {c.log_odds:.1f}"
             )
+        if len(pose.candidates) > MOST_CANDIDATES:
+            lines.append(f"and {len(pose.candidates) - MOST_CANDIDATES} more candidates")
         return "\n".join(lines)
     theta = with_sigma(1e3 * pose.theta_rad, 1e3 * pose.sigma_theta_rad)
     lines = [
@@ -241,34 +305,12 @@ def overlay_figure(
         Image minus model, NaN where pixels were left out; a panel of its own.
     title : str
     """
-    panels = 1 if residuals is None else 2
-    aspect = image.shape[0] / image.shape[1]
-    panel_width = 8.0
-    figure = Figure(
-        figsize=(panels * panel_width, panel_width * min(max(aspect, 0.3), 2.0) + 2.2),
-        dpi=_DPI,
-        layout="constrained",
-    )
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, panels, squeeze=False)[0]
-    low, high = _grey_range(image)
-    shown = _show(axes[0], image, system.pitch_um, cmap="gray", vmin=low, vmax=high)
-    bar = figure.colorbar(shown, ax=axes[0], location="bottom", shrink=0.7, pad=0.02)
-    bar.set_label("grey level")
-    if pose.ok and pose.projection is not None:
-        view = _View(pose.projection, system.mask, image.shape, system.pitch_um)
-        _draw_contours(axes[0], view)
-        _draw_code_lines(axes[0], view)
-    centre = (image.shape[1] - 1) / 2, (image.shape[0] - 1) / 2
-    stroke = [patheffects.withStroke(linewidth=3.5, foreground="black")]
-    axes[0].plot(*centre, "+", ms=16, mew=1.8, color="#ff4dff", path_effects=stroke)
-    lattice = "Fitted lattice, code columns (orange) and rows (blue), pivots, " if pose.ok else ""
-    axes[0].set_title(f"{lattice}reference point (+)", fontsize=10)
+    caption = f"{title}\n{_caption(pose)}" if title else _caption(pose)
+    sheet = _Sheet(1 if residuals is None else 2, image.shape, caption)
+    _draw_image(sheet, image, pose, system)
     if residuals is not None:
-        _draw_residuals(figure, axes[1], residuals, system.pitch_um)
-    heading = f"{title}\n{_caption(pose)}" if title else _caption(pose)
-    figure.suptitle(heading, fontsize=10, x=0.01, ha="left", wrap=True)
-    return figure
+        _draw_residuals(sheet, residuals, system.pitch_um)
+    return sheet.figure
 
 
 def draw_overlay(

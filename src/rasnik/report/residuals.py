@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,9 @@ from rasnik.mask import ChessField
 __all__ = ["residual_image"]
 
 _MOST_PIXELS = 60_000  # that the light is fitted to
-_LARGEST_KURTOSIS = 2.0
+_MOST_KURTOSIS = 2.0
+_STEPS = 3
+_LEVEL_0, _LEVEL_1 = np.zeros(6), np.eye(6)[0]
 
 
 def _valid(image: NDArray[np.float32], bounds_px: tuple[int, int, int, int] | None) -> Any:
@@ -34,7 +35,7 @@ def _valid(image: NDArray[np.float32], bounds_px: tuple[int, int, int, int] | No
 
 def _slopes(
     mask: ChessField, pose: Pose, look: Appearance, camera: Camera
-) -> tuple[NDArray[np.float32], list[tuple[str, float, NDArray[np.float32]]]]:
+) -> tuple[NDArray[np.float32], list[tuple[str, NDArray[np.float32]]]]:
     """The pattern (0 black, 1 white), and its change with each parameter of the edges."""
     projection = pose.projection
     assert projection is not None
@@ -51,46 +52,68 @@ def _slopes(
     changes = []
     for name, step in steps.items():
         slope = (pattern(**{name: getattr(look, name) + step}) - level) / step
-        changes.append((name, step, slope))
+        changes.append((name, slope))
     return level, changes
 
 
 def _fitted_look(
     image: NDArray[np.float32], valid: Any, mask: ChessField, pose: Pose, camera: Camera
 ) -> Appearance:
-    """Light, and small corrections of the edges, that explain the image best at this pose."""
+    """Light and edges that explain the image best at this pose."""
     blur = pose.blur_um if np.isfinite(pose.blur_um) else camera.pixel_um
     shift = pose.edge_shift_um if np.isfinite(pose.edge_shift_um) else 0.0
     look = Appearance.uniform(0.0, 1.0, max(blur, MIN_BLUR_PX * camera.pixel_um))
     look = look.with_(edge_shift_um=shift)
-    level, changes = _slopes(mask, pose, look, camera)
+    for _ in range(_STEPS):
+        look = _better_look(image, valid, mask, pose, camera, look)
+    return look
+
+
+def _better_look(
+    image: NDArray[np.float32],
+    valid: Any,
+    mask: ChessField,
+    pose: Pose,
+    camera: Camera,
+    look: Appearance,
+) -> Appearance:
+    """One Gauss-Newton step: the light at once, the edges by their slopes."""
+    edges = look.with_(dark=_LEVEL_0, light=_LEVEL_1)
+    level, changes = _slopes(mask, pose, edges, camera)
     rows, columns = np.nonzero(valid)
     stride = 1 + len(rows) // _MOST_PIXELS
     rows, columns = rows[::stride], columns[::stride]
     height, width = camera.shape
-    light = surface(
-        2 * columns / width - (width - 1) / width, 2 * rows / height - (height - 1) / height
-    )
-    white = level[rows, columns]
+    u, v = (2 * columns - width + 1) / width, (2 * rows - height + 1) / height
+    light, white = surface(u, v), level[rows, columns]
     terms = [*(light * (1 - white)), *(light * white)]
-    terms += [slope[rows, columns] for _, _, slope in changes]
-    basis, values = np.array(terms, dtype=np.float64).T, image[rows, columns].astype(np.float64)
+    terms += [slope[rows, columns] for _, slope in changes]
+    found = _robust_solution(np.array(terms, dtype=np.float64).T, image[rows, columns])
+    contrast = float(found[6] - found[0]) or 1.0
+    names = (name for name, _ in changes)
+    step = {name: float(slope) / contrast for name, slope in zip(names, found[12:], strict=True)}
+    blur = max(look.blur_um + step["blur_um"], 0.5 * look.blur_um)
+    kurtosis = np.clip(look.kurtosis + step["kurtosis"], -_MOST_KURTOSIS, _MOST_KURTOSIS)
+    return look.with_(
+        dark=found[:6],
+        light=found[6:12],
+        blur_um=max(blur, MIN_BLUR_PX * camera.pixel_um),
+        edge_shift_um=look.edge_shift_um + step["edge_shift_um"],
+        kurtosis=float(kurtosis),
+    )
+
+
+def _robust_solution(
+    basis: NDArray[np.float64], values: NDArray[np.float32]
+) -> NDArray[np.float64]:
+    """Least squares, with dirt left out as it shows."""
     used = np.ones(len(values), dtype=bool)
-    for _ in range(4):  # dirt is left out as it shows
-        found = np.asarray(np.linalg.lstsq(basis[used], values[used], rcond=1e-10)[0], np.float64)
+    for _ in range(4):
+        found = np.linalg.lstsq(basis[used], values[used], rcond=1e-10)[0]
         residual = values - basis @ found
         spread = 1.4826 * float(np.median(np.abs(residual[used])))
         used = np.abs(residual) <= 5 * spread
-    step = float(found[6] - found[0]) or 1.0
-    corrections = dict(zip((name for name, _, _ in changes), found[12:] / step, strict=True))
-    return replace(
-        look,
-        dark=found[:6],
-        light=found[6:12],
-        blur_um=max(look.blur_um + corrections["blur_um"], MIN_BLUR_PX * camera.pixel_um),
-        edge_shift_um=look.edge_shift_um + corrections["edge_shift_um"],
-        kurtosis=float(np.clip(corrections["kurtosis"], -_LARGEST_KURTOSIS, _LARGEST_KURTOSIS)),
-    )
+    return np.asarray(found, dtype=np.float64)
 
 
 def residual_image(
