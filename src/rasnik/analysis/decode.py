@@ -32,7 +32,7 @@ _WINDOW = 30.0
 _MOST_CANDIDATES = 16
 # A plain chessboard, or another code, makes hardly any position better than no code at all,
 # leaves inversions unexplained and predicts ones that are not seen.
-_LEAST_EVIDENCE = 20.0
+_LEAST_EVIDENCE = 25.0
 _LEAST_EXPLAINED = 0.5
 _LEAST_SEEN = 0.75
 _QUARTER_TURN_RAD = np.radians(40)

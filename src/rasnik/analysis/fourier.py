@@ -8,13 +8,14 @@ the field centres follow. No prior knowledge but the pixel size is used.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
 from numba import njit
 from numpy.typing import NDArray
 
+from rasnik.analysis.coverage import Coverage, coverage, region_of
 from rasnik.analysis.flags import Flag
 from rasnik.analysis.lattice import Lattice
 from rasnik.analysis.levels import fit_levels
@@ -29,6 +30,8 @@ Array = NDArray[np.float64]
 #: Below this the pixel washes out the fields.
 LEAST_PIXELS_PER_FIELD = 2.5
 _SMALLEST_IMAGE_PX = 16
+# Fields larger than this would not show a pattern at all in any image.
+_LEAST_FIELDS_PER_PIXEL = 1e-7
 
 # Peaks this close to zero frequency (in bins) are light, not pattern.
 _LEAST_BINS = 2.5
@@ -37,11 +40,16 @@ _PAIRS_TRIED = 10
 # Primaries of a square pattern are equal and perpendicular; a slanted view changes both.
 _MOST_LENGTH_RATIO = 1.7
 _LEAST_SINE = math.sin(math.radians(55))
-# A lattice is accepted at once above the first, and at all above the second agreement.
+# A lattice is accepted at once above the first, and at all above the second agreement ...
 _GOOD_AGREEMENT = 0.80
-_LEAST_AGREEMENT = 0.68
-# and if that agreement is this many standard deviations away from chance
+_LEAST_AGREEMENT = 0.75
+# ... if that is this many standard deviations away from chance and covers this much of the view.
 _LEAST_SIGNIFICANCE = 5.0
+_LEAST_COVERAGE = 0.12
+# Below this coverage the transform is repeated over the part that shows the mask.
+_WHOLE_COVERAGE = 0.93
+_REGION_PASSES = 3
+_LEAST_REGAINED = 0.8
 _NOISE_QUANTILE = 0.2
 _NOISE_FREQUENCY = 0.2  # cycles per pixel
 
@@ -107,10 +115,22 @@ class _Trial:
     """A lattice under test; `pixel_matrix` acts on image (column, row, 1)."""
 
     tones: ToneLattice
+    picture: Picture
     pixel_matrix: Array
     samples: FieldSamples
-    agreement: float
-    significance: float
+    seen: Coverage
+
+    @property
+    def merit(self) -> float:
+        return self.seen.fraction * (self.seen.agreement - 0.5)
+
+    def agrees(self, least: float) -> bool:
+        """Whether the fields show the chessboard that the lattice says."""
+        return (
+            self.seen.agreement > least
+            and self.seen.significance > _LEAST_SIGNIFICANCE
+            and self.seen.fraction > _LEAST_COVERAGE
+        )
 
 
 def find_lattice(
@@ -143,27 +163,23 @@ def find_lattice(
     if min(image.shape) < _SMALLEST_IMAGE_PX or (valid is not None and valid.mean() < 0.05):
         return Flag.NO_MASK
     picture = prepare(image, valid)
-    if picture.spread == 0 and not picture.residual.any():
+    if not picture.windowed.any():
         return Flag.BLANK
-    spectrum = scipy.fft.rfft2(
-        picture.residual * (picture.window_v[:, None] * picture.window_u), workers=1
-    )
+    spectrum = scipy.fft.rfft2(picture.windowed, workers=1)
     if noise_variance is None:
         noise_variance = _noise_floor(picture, spectrum)
     best: _Trial | None = None
-    for pair in _candidate_pairs(spectrum, picture.residual.shape[1]):
-        trial = _try_pair(image, valid, picture, pair, noise_variance)
-        if trial is not None and (best is None or trial.agreement > best.agreement):
+    for pair in _candidate_pairs(spectrum, picture.windowed.shape[1]):
+        trial = _trial(image, valid, picture, pair, noise_variance)
+        if trial is not None and (best is None or trial.merit > best.merit):
             best = trial
-            if trial.agreement > _GOOD_AGREEMENT and trial.significance > _LEAST_SIGNIFICANCE:
+            if trial.agrees(_GOOD_AGREEMENT):
                 break
-    if (
-        best is None
-        or best.agreement < _LEAST_AGREEMENT
-        or best.significance < _LEAST_SIGNIFICANCE
-    ):
+    if best is not None and best.seen.fraction < _WHOLE_COVERAGE:
+        best = _within_region(image, valid, best, noise_variance)
+    if best is None or not best.agrees(_LEAST_AGREEMENT):
         return Flag.BLANK if _is_blank(image, valid) else Flag.NO_MASK
-    return _finish(image, pixel_um, picture, best, noise_variance)
+    return _finish(image.shape, pixel_um, best, noise_variance)
 
 
 def _clean(
@@ -193,12 +209,11 @@ def _noise_floor(picture: Picture, spectrum: NDArray[np.complex64]) -> float:
     """Variance per pixel from the spectral power (exponential for noise) where both frequencies
     are high: a low quantile, since the pattern only adds to it.
     """
-    height, width = picture.residual.shape
+    height, width = picture.windowed.shape
     high_v = slice(int(_NOISE_FREQUENCY * height), int((1 - _NOISE_FREQUENCY) * height))
     part = spectrum[high_v, int(_NOISE_FREQUENCY * width) :][::2, ::2]
     quantile = float(np.quantile(part.real**2 + part.imag**2, _NOISE_QUANTILE))
-    windows = np.sum(picture.window_u**2, dtype=float) * np.sum(picture.window_v**2, dtype=float)
-    return quantile / -math.log1p(-_NOISE_QUANTILE) / float(windows)
+    return quantile / -math.log1p(-_NOISE_QUANTILE) / max(picture.noise_moments[2, 2], 1e-12)
 
 
 def _candidate_pairs(spectrum: NDArray[np.complex64], width: int) -> list[Array]:
@@ -219,60 +234,64 @@ def _candidate_pairs(spectrum: NDArray[np.complex64], width: int) -> list[Array]
     return [wave[[a, b]] for _, a, b in pairs[:_PAIRS_TRIED]]
 
 
-def _try_pair(
+def _trial(
     image: NDArray[np.float32],
     valid: NDArray[np.bool_] | None,
     picture: Picture,
     pair: Array,
     noise_variance: float,
+    steps: int = 2,
 ) -> _Trial | None:
-    """Refine a pair of peaks to a lattice and see whether the fields agree with it."""
-    tones = refine(picture, pair)
-    start = primary_pair(tones)
-    if abs(np.linalg.det(start[:, :2])) < 1e-9:
+    """Refine a pair of wave vectors to a lattice and see whether the fields agree with it."""
+    start = primary_pair(refine(picture, pair, steps))
+    if not abs(np.linalg.det(start[:, :2])) > _LEAST_FIELDS_PER_PIXEL:
         return None
-    lattice = chess_lattice(picture, start, noise_variance)
-    left, top, right, bottom = picture.bounds_px
-    to_centre = np.array(
-        [[1.0, 0.0, -(left + right - 1) / 2], [0.0, 1.0, -(top + bottom - 1) / 2], [0.0, 0.0, 1.0]]
-    )
-    pixel_matrix = lattice.matrix @ to_centre
+    tones = chess_lattice(picture, start, noise_variance)
+    pixel_matrix = tones.matrix.copy()
+    pixel_matrix[:, 2] -= pixel_matrix[:, :2] @ picture.centroid_px
     samples = sample_fields(image, pixel_matrix, picture.bounds_px, valid)
-    agreement, significance = _agreement(samples)
-    return _Trial(lattice, pixel_matrix, samples, agreement, significance)
+    return _Trial(tones, picture, pixel_matrix, samples, coverage(samples))
 
 
-def _agreement(samples: FieldSamples) -> tuple[float, float]:
-    """Fraction of the fields brighter or darker than their neighbours as the chessboard says.
+def _within_region(
+    image: NDArray[np.float32],
+    valid: NDArray[np.bool_] | None,
+    trial: _Trial,
+    noise_variance: float,
+) -> _Trial:
+    """Repeat the transform over the part of the image that shows the mask.
 
-    Fields are compared with the mean of their four neighbours, so slow changes of the light
-    don't matter. Also returns by how many standard deviations that beats chance.
+    That part may grow: the first lattice is true near the window's centroid only.
     """
-    grey, there = samples.grey, samples.present
-    whole = (
-        there[1:-1, 1:-1]
-        & there[:-2, 1:-1]
-        & there[2:, 1:-1]
-        & there[1:-1, :-2]
-        & there[1:-1, 2:]
-    )
-    count = int(whole.sum())
-    if count < 9:
-        return 0.0, 0.0
-    around = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:]
-    contrast = (grey[1:-1, 1:-1] - around / 4) * samples.chess[1:-1, 1:-1]
-    agreement = float((contrast[whole] > 0).mean())
-    return agreement, (agreement - 0.5) * 2 * math.sqrt(count)
+    bounds = trial.picture.bounds_px
+    for _ in range(_REGION_PASSES):
+        samples = trial.samples
+        region = region_of(
+            trial.seen.fields, samples.first_i, samples.first_j, trial.pixel_matrix, image.shape
+        )
+        if not region.any():
+            return trial
+        pair = np.pi * np.array([[1, -1], [1, 1]]) @ trial.pixel_matrix[:, :2]
+        picture = prepare(image, valid, region)
+        again = _trial(image, valid, picture, pair, noise_variance, steps=4)
+        if again is None:
+            return trial
+        # look for fields in the whole picture again
+        samples = sample_fields(image, again.pixel_matrix, bounds, valid)
+        again = replace(again, samples=samples, seen=coverage(samples))
+        if again.merit < _LEAST_REGAINED * trial.merit:
+            return trial
+        settled = again.seen.fraction < 1.02 * trial.seen.fraction
+        trial = again
+        if settled:
+            break
+    return trial
 
 
 def _finish(
-    image: NDArray[np.float32],
-    pixel_um: float,
-    picture: Picture,
-    trial: _Trial,
-    noise_variance: float,
+    shape: tuple[int, int], pixel_um: float, trial: _Trial, noise_variance: float
 ) -> Lattice | Flag:
-    height, width = image.shape
+    height, width = shape
     matrix = trial.pixel_matrix.copy()
     # from (column, row) to micrometres from the centre of the image
     matrix[:, 2] += matrix[:, :2] @ [(width - 1) / 2, (height - 1) / 2]
@@ -280,7 +299,8 @@ def _finish(
     pixels_per_field = 1 / (math.sqrt(abs(np.linalg.det(matrix[:, :2]))) * pixel_um)
     if pixels_per_field < LEAST_PIXELS_PER_FIELD:
         return Flag.FIELD_TOO_SMALL
-    levels = fit_levels(trial.samples)
+    samples = replace(trial.samples, present=trial.seen.fields)
+    levels = fit_levels(samples)
     if levels is None:
         return Flag.NO_MASK
     blur_px = trial.tones.blur_px
@@ -288,31 +308,29 @@ def _finish(
         blur_px = _blur_from_mixing(levels.side, levels.own) * pixels_per_field
     return Lattice(
         matrix=matrix,
-        covariance=_to_image_centre(trial.tones.covariance, picture, image.shape, pixel_um),
+        covariance=_about_image_centre(trial, shape, pixel_um),
         pixels_per_field=pixels_per_field,
         blur_um=math.sqrt(max(blur_px**2 - 1 / 12, 0.0)) * pixel_um,
         noise_variance=noise_variance,
-        score=trial.agreement,
+        score=trial.seen.agreement,
+        coverage=trial.seen.fraction,
         shape=(height, width),
         pixel_um=pixel_um,
-        bounds_px=picture.bounds_px,
         tones=trial.tones,
-        samples=trial.samples,
+        picture=trial.picture,
+        samples=samples,
         levels=levels,
     )
 
 
-def _to_image_centre(
-    covariance: Array, picture: Picture, shape: tuple[int, int], pixel_um: float
-) -> Array:
-    """Covariance of the matrix about the image's centre in um, from the picture's in pixels."""
-    left, top, right, bottom = picture.bounds_px
-    shift_u, shift_v = (shape[1] - left - right) / 2, (shape[0] - top - bottom) / 2
-    block = np.array(
-        [[1 / pixel_um, 0.0, 0.0], [0.0, 1 / pixel_um, 0.0], [shift_u, shift_v, 1.0]]
-    )
+def _about_image_centre(trial: _Trial, shape: tuple[int, int], pixel_um: float) -> Array:
+    """Covariance of the matrix about the image's centre in um, from the centroid's in pixels."""
+    column, row = trial.picture.centroid_px
+    shift_u, shift_v = (shape[1] - 1) / 2 - column, (shape[0] - 1) / 2 - row
+    block = np.array([[1 / pixel_um, 0.0, 0.0], [0.0, 1 / pixel_um, 0.0], [shift_u, shift_v, 1.0]])
     change = np.kron(np.eye(2), block)
-    return change @ covariance @ change.T
+    result: Array = change @ trial.tones.covariance @ change.T
+    return result
 
 
 def _blur_from_mixing(side: float, own: float) -> float:
@@ -324,8 +342,12 @@ def _blur_from_mixing(side: float, own: float) -> float:
     low, high = 0.01, 2.0
     for _ in range(40):
         middle = (low + high) / 2
-        low, high = (middle, high) if math.erf(0.5 / middle / math.sqrt(2)) > own_part else (
-            low,
-            middle,
+        low, high = (
+            (middle, high)
+            if math.erf(0.5 / middle / math.sqrt(2)) > own_part
+            else (
+                low,
+                middle,
+            )
         )
     return low

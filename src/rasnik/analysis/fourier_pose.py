@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from rasnik.analysis.decode import Decoding, LabelledLattice
 from rasnik.analysis.flags import Flag
 from rasnik.analysis.lattice import Lattice
 from rasnik.analysis.levels import quadratic_basis
-from rasnik.analysis.picture import hann
 from rasnik.analysis.pose import Candidate, Pose
 from rasnik.analysis.tones import combine
 from rasnik.imaging.projection import Projection
@@ -55,9 +55,11 @@ def fourier_pose(
         return Pose(flags=lattice)
     if decoding is None or decoding.best is None:
         return Pose(flags=Flag.NO_CODE if decoding is None else decoding.flags)
-    candidates = tuple(
-        _candidate(one, orientation) for one in decoding.candidates
-    ) if decoding.flags & Flag.AMBIGUOUS else ()
+    candidates = (
+        tuple(_candidate(one, orientation) for one in decoding.candidates)
+        if decoding.flags & Flag.AMBIGUOUS
+        else ()
+    )
     if not decoding.ok:
         return Pose(
             flags=decoding.flags,
@@ -117,48 +119,16 @@ def code_step(lattice: Lattice, best: LabelledLattice, mask: ChessField) -> Arra
     colour. At the tones s exp(-i k . c) is the same for all plain fields and opposite for inverted
     ones: without gradients of W, they would make the tones weaker and not shift them at all.
     """
-    left, top, right, bottom = lattice.bounds_px
-    height, width = lattice.shape
-    samples = lattice.samples
-    half_u, half_v = (right - left) / 2, (bottom - top) / 2
-    # field centres in pixels from the centre of the picture
-    u = samples.u * width / 2 + (width - left - right) / 2
-    v = samples.v * height / 2 + (height - top - bottom) / 2
-    x, y = best.projection.to_mask(
-        samples.u * width / 2 * lattice.pixel_um, samples.v * height / 2 * lattice.pixel_um
-    )
-    i, j = (np.floor(value / mask.field_um).astype(np.int64) for value in (x, y))
-    inside = (np.abs(u) < half_u) & (np.abs(v) < half_v)
-    chosen = inside & mask.inverted(i, j)
-    u, v = u[chosen], v[chosen]
-
-    def contrast(u_px: Array, v_px: Array) -> Array:
-        basis = quadratic_basis(
-            (u_px - (width - left - right) / 2) * 2 / width,
-            (v_px - (height - top - bottom) / 2) * 2 / height,
-        )
-        level: Array = basis @ lattice.levels.half
-        return level
-
-    def weight(u_px: Array, v_px: Array) -> Array:
-        taper_u = 0.5 + 0.5 * np.cos(np.pi * u_px / half_u)
-        taper_v = 0.5 + 0.5 * np.cos(np.pi * v_px / half_v)
-        return taper_u * taper_v * contrast(u_px, v_px)
-
-    e = 0.5  # pixels, for derivatives of a smooth function
-    here = weight(u, v)
-    by_u = (weight(u + e, v) - weight(u - e, v)) / (2 * e)
-    by_v = (weight(u, v + e) - weight(u, v - e)) / (2 * e)
+    u, v = _inverted_fields(lattice, best, mask)
+    here, by_u, by_v = _weight_and_slopes(lattice, u, v)
 
     # all fields: sums become integrals, in which gradients cancel
+    picture = lattice.picture
     gradients = lattice.matrix[:, :2] * lattice.pixel_um  # d(p, q) / d(u, v) per pixel
     per_pixel = abs(np.linalg.det(gradients))
-    grid_u = np.arange(0.5 - half_u, half_u, 4.0)
-    grid_v = np.arange(0.5 - half_v, half_v, 4.0)
-    whole = 16.0 * per_pixel * weight(grid_u, grid_v[:, None])
-    total, total_u, total_v = (
-        float((whole * factor).sum()) for factor in (1.0, grid_u, grid_v[:, None])
-    )
+    grid_u, grid_v = picture.u_px[2::4], picture.v_px[2::4, None]
+    whole = 16 * per_pixel * picture.window[2::4, 2::4] * _contrast(lattice, grid_u, grid_v)
+    total, total_u, total_v = (float((whole * factor).sum()) for factor in (1.0, grid_u, grid_v))
 
     orders = lattice.tones.orders
     waves = np.pi * orders @ gradients
@@ -166,27 +136,70 @@ def code_step(lattice: Lattice, best: LabelledLattice, mask: ChessField) -> Arra
     slope = -(np.linalg.inv(gradients) @ (1 / (np.pi * orders)).T).T - blur_px**2 * waves
     slope_u, slope_v = slope[:, 0], slope[:, 1]
     transform = total - 2 * here.sum() - 2j * (slope_u * by_u.sum() + slope_v * by_v.sum())
-    moment_u = total_u - 2 * (u * here).sum() - 2j * (
-        slope_u * (here + u * by_u).sum() + slope_v * (u * by_v).sum()
+    moment_u = (
+        total_u
+        - 2 * (u * here).sum()
+        - 2j * (slope_u * (here + u * by_u).sum() + slope_v * (u * by_v).sum())
     )
-    moment_v = total_v - 2 * (v * here).sum() - 2j * (
-        slope_u * (v * by_u).sum() + slope_v * (here + v * by_v).sum()
+    moment_v = (
+        total_v
+        - 2 * (v * here).sum()
+        - 2j * (slope_u * (v * by_u).sum() + slope_v * (here + v * by_v).sum())
     )
-    variance = [
-        float((hann(n) * position**2).sum() / hann(n).sum())
-        for n, position in (
-            (right - left, np.arange(right - left) - (right - left - 1) / 2),
-            (bottom - top, np.arange(bottom - top) - (bottom - top - 1) / 2),
-        )
-    ]
-    offset = np.column_stack(
-        [(moment_u / transform).imag / variance[0], (moment_v / transform).imag / variance[1]]
+    moments = np.column_stack([(moment_u / transform).imag, (moment_v / transform).imag])
+    step, _ = combine(
+        orders, lattice.tones.weight, np.angle(transform), moments @ np.linalg.inv(picture.variance)
     )
-    step, _ = combine(orders, lattice.tones.weight, np.angle(transform), offset)
-    # from pixels about the picture's centre to micrometres about the image's
-    step[:, 2] += step[:, :2] @ [(width - left - right) / 2, (height - top - bottom) / 2]
+    # from pixels about the window's centroid to micrometres about the image's centre
+    height, width = lattice.shape
+    column, row = picture.centroid_px
+    step[:, 2] += step[:, :2] @ [(width - 1) / 2 - column, (height - 1) / 2 - row]
     step[:, :2] /= lattice.pixel_um
     return step
+
+
+def _inverted_fields(
+    lattice: Lattice, best: LabelledLattice, mask: ChessField
+) -> tuple[Array, Array]:
+    """Centres of the inverted fields within the window, in pixels from its centroid."""
+    height, width = lattice.shape
+    samples, picture = lattice.samples, lattice.picture
+    u, v = samples.u * width / 2, samples.v * height / 2  # pixels from the image's centre
+    x, y = best.projection.to_mask(u * lattice.pixel_um, v * lattice.pixel_um)
+    i, j = (np.floor(value / mask.field_um).astype(np.int64) for value in (x, y))
+    column, row = picture.centroid_px
+    u, v = u + (width - 1) / 2 - column, v + (height - 1) / 2 - row
+    chosen = (
+        mask.inverted(i, j)
+        & (u > picture.u_px[1]) & (u < picture.u_px[-2])
+        & (v > picture.v_px[1]) & (v < picture.v_px[-2])
+    )  # fmt: skip
+    return u[chosen], v[chosen]
+
+
+def _contrast(lattice: Lattice, u: Array, v: Array) -> Array:
+    """Half the black-white step at points in pixels from the window's centroid."""
+    height, width = lattice.shape
+    column, row = lattice.picture.centroid_px
+    basis = quadratic_basis(
+        (u + column - (width - 1) / 2) * 2 / width, (v + row - (height - 1) / 2) * 2 / height
+    )
+    level: Array = basis @ lattice.levels.half
+    return level
+
+
+def _weight_and_slopes(lattice: Lattice, u: Array, v: Array) -> tuple[Array, Array, Array]:
+    """Window times contrast at points in pixels from the centroid, and its slopes per pixel."""
+    picture = lattice.picture
+    column, row = u - picture.u_px[0], v - picture.v_px[0]
+
+    def weight(du: int, dv: int) -> Array:
+        window = map_coordinates(picture.window, [row + dv, column + du], order=1)
+        product: Array = window * _contrast(lattice, u + du, v + dv)
+        return product
+
+    by_u, by_v = (weight(1, 0) - weight(-1, 0)) / 2, (weight(0, 1) - weight(0, -1)) / 2
+    return weight(0, 0), by_u, by_v
 
 
 def _pose_covariance(
@@ -198,7 +211,7 @@ def _pose_covariance(
     derivative = np.zeros((4, 6))
     derivative[0, 2] = derivative[1, 5] = 1.0
     size = np.sqrt(abs(np.linalg.det(projection.jacobian)))
-    for k, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+    for row, column in ((0, 0), (0, 1), (1, 0), (1, 1)):
         step = 1e-6 * size
         ends = []
         for sign in (1, -1):

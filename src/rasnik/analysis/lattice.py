@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rasnik.analysis.levels import Levels
+from rasnik.analysis.picture import Picture
 from rasnik.analysis.sampling import FieldSamples
 from rasnik.analysis.tones import ToneLattice
 
@@ -41,13 +42,15 @@ class Lattice:
     score : float
         Fraction of the fields that are brighter or darker than their neighbours as the
         chessboard demands: 0.5 by chance, near 0.9 for a clean coded mask.
+    coverage : float
+        Fraction of the picture that shows the mask.
     shape : tuple of int
         (height, width) of the image.
     pixel_um : float
-    bounds_px : tuple of int
-        (left, top, right, bottom) of the picture inside dark borders, right and bottom exclusive.
     tones : ToneLattice
         The spectral lines behind `matrix`.
+    picture : Picture
+        The part of the image and the window used.
     samples : FieldSamples
         Grey levels of the field centres.
     levels : Levels
@@ -60,12 +63,18 @@ class Lattice:
     blur_um: float
     noise_variance: float
     score: float
+    coverage: float
     shape: tuple[int, int]
     pixel_um: float
-    bounds_px: tuple[int, int, int, int]
     tones: ToneLattice = field(repr=False)
+    picture: Picture = field(repr=False)
     samples: FieldSamples = field(repr=False)
     levels: Levels = field(repr=False)
+
+    @property
+    def bounds_px(self) -> tuple[int, int, int, int]:
+        """(left, top, right, bottom) of the picture, right and bottom exclusive."""
+        return self.picture.bounds_px
 
     @property
     def dark(self) -> Array:

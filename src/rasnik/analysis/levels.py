@@ -131,7 +131,7 @@ def _surfaces(basis: Array, mixed: Array, grey: Array, weight: Array) -> tuple[A
     """Weighted least squares for the coefficients of middle and half."""
     design = np.hstack([basis, basis * mixed[:, None]])
     weighted = design * weight[:, None]
-    solution = np.linalg.lstsq(weighted.T @ design, weighted.T @ grey, rcond=1e-10)[0]
+    solution: Array = np.linalg.lstsq(weighted.T @ design, weighted.T @ grey, rcond=1e-10)[0]
     return solution[:6], solution[6:]
 
 

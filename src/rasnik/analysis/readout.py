@@ -71,29 +71,8 @@ def read_levels(samples: FieldSamples, levels: Levels) -> Readout:
     floor = np.exp(-np.where(level > context, LLR_BOUND_BRIGHT, LLR_BOUND_DARK))
     plain = np.exp(-0.5 * ((value - 1) / noise) ** 2) + floor
     inverted = np.exp(-0.5 * ((value + 1) / noise) ** 2) + floor
-    present = samples.present & _shows_mask(value, samples.present)
+    present = samples.present
     with np.errstate(invalid="ignore"):
         llr = np.where(present, np.log(inverted / plain), 0.0)
     typical = float(np.median(noise[samples.present])) if samples.present.any() else 0.0
     return Readout(samples.first_i, samples.first_j, llr, present, value, typical)
-
-
-# In any square of this many fields of a coded mask (9 x 9 for 8 bits) at least half are plain;
-# where the mean over the square is lower, the mask is not there.
-_NEIGHBOURHOOD = 9
-_LEAST_MEAN = 0.25
-
-
-def _shows_mask(value: Array, present: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether the surroundings of a field look like a chessboard at all."""
-    sums = _box_sum(np.where(present, np.clip(value, -1, 1), 0.0), _NEIGHBOURHOOD)
-    counts = _box_sum(present.astype(float), _NEIGHBOURHOOD)
-    return sums > _LEAST_MEAN * counts
-
-
-def _box_sum(values: Array, side: int) -> Array:
-    reach = side // 2
-    padded = np.pad(values, reach + 1)[:-1, :-1]
-    total = padded.cumsum(axis=0).cumsum(axis=1)
-    summed: Array = total[side:, side:] - total[:-side, side:] - total[side:, :-side]
-    return summed + total[:-side, :-side]

@@ -48,9 +48,7 @@ class FieldSamples:
     def chess(self) -> Array:
         """+1 where the chessboard is bright (i + j even), -1 where it is dark."""
         rows, columns = self.grey.shape
-        parity = np.add.outer(
-            np.arange(rows) + self.first_j, np.arange(columns) + self.first_i
-        )
+        parity = np.add.outer(np.arange(rows) + self.first_j, np.arange(columns) + self.first_i)
         return 1.0 - 2.0 * (parity % 2)
 
 
@@ -204,7 +202,7 @@ def sample_fields(
 
 
 def _points(area_px: float, p: Array, q: Array) -> int:
-    """Sample points per direction, from the area of the view in pixels and its corners in fields."""
+    """Sample points per direction, from the area in pixels and the corners in fields."""
     across = abs((p[3] - p[0]) * (q[2] - q[1]) - (p[2] - p[1]) * (q[3] - q[0])) / 2
     side_px = math.sqrt(area_px / max(across, 1e-9))
     if side_px < _LEAST_AVERAGED_PX:

@@ -42,7 +42,7 @@ class Tones:
     wave : ndarray, shape (n, 2)
         Wave vectors (radians per pixel).
     transform : ndarray of complex, shape (n,)
-        Sum of window x residual x exp(-i wave . position).
+        Sum of windowed picture x exp(-i wave . position), positions from the centroid.
     offset : ndarray, shape (n, 2)
         Estimate of (true wave vector) - `wave`.
     """
@@ -56,10 +56,10 @@ def measure(picture: Picture, wave: Array) -> Tones:
     """Evaluate the windowed transform of `picture` at each wave vector, shape (n, 2)."""
     u, v = picture.u_px, picture.v_px
     n = len(wave)
-    along_u = _waves(u, wave[:, 0], picture.window_u)  # [cos, -sin]
+    along_u = _waves(u, wave[:, 0])
     basis = np.hstack([along_u, along_u * (u / u[-1])[:, None]])
-    parts = (picture.residual @ basis.astype(np.float32)).astype(np.float64)
-    along_v = _waves(v, wave[:, 1], picture.window_v)
+    parts = (picture.windowed @ basis.astype(np.float32)).astype(np.float64)
+    along_v = _waves(v, wave[:, 1])
     cosine, sine = along_v[:, :n], along_v[:, n:]
 
     def sum_over_v(real: Array, imag: Array, weight: Array | float = 1.0) -> Complexes:
@@ -74,24 +74,14 @@ def measure(picture: Picture, wave: Array) -> Tones:
     by_u = sum_over_v(*first) * u[-1]
     by_v = sum_over_v(*plain, v[:, None])
     safe = np.where(transform == 0, 1.0, transform)
-    variance = window_variance(picture)
-    offset = np.stack([(by_u / safe).imag / variance[0], (by_v / safe).imag / variance[1]], axis=1)
-    return Tones(wave=wave, transform=transform, offset=offset)
+    moment = np.stack([(by_u / safe).imag, (by_v / safe).imag], axis=1)
+    return Tones(wave, transform, moment @ np.linalg.inv(picture.variance))
 
 
-def _waves(position: Array, wave: Array, window: NDArray[np.float32]) -> Array:
-    """Real and imaginary parts of window x exp(-i wave position), side by side, (m, 2 n)."""
+def _waves(position: Array, wave: Array) -> Array:
+    """Real and imaginary parts of exp(-i wave position) side by side, shape (m, 2 n)."""
     phase = np.outer(position, wave)
-    return np.hstack([np.cos(phase), -np.sin(phase)]) * window[:, None]
-
-
-def window_variance(picture: Picture) -> tuple[float, float]:
-    """Second moments of the window along u and v, pixels squared."""
-    wu, wv = picture.window_u.astype(float), picture.window_v.astype(float)
-    return (
-        float((wu * picture.u_px**2).sum() / wu.sum()),
-        float((wv * picture.v_px**2).sum() / wv.sum()),
-    )
+    return np.hstack([np.cos(phase), -np.sin(phase)])
 
 
 def refine(picture: Picture, wave: Array, steps: int = 2) -> Tones:
@@ -99,7 +89,7 @@ def refine(picture: Picture, wave: Array, steps: int = 2) -> Tones:
 
     The steps are limited to one bin of the transform, so a start within a bin is needed.
     """
-    height, width = picture.residual.shape
+    height, width = picture.windowed.shape
     limit = np.array([2 * np.pi / width, 2 * np.pi / height])
     start = wave
     for _ in range(steps):
@@ -114,7 +104,7 @@ def primary_pair(tones: Tones) -> Array:
     Returns
     -------
     ndarray, shape (2, 3)
-        (p, q) = result @ (u_px, v_px, 1) from the centre of the picture, with p growing
+        (p, q) = result @ (u_px, v_px, 1) from the centroid of the window, with p growing
         rightward and q upward within 45 degrees.
     """
     # The pattern with bright fields at even i + j is  cos pi(p - q) - cos pi(p + q)  to first
@@ -136,7 +126,7 @@ def primary_pair(tones: Tones) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ToneLattice:
-    """A chess lattice from the phases of its tones, in pixels from the picture's centre.
+    """A chess lattice from the phases of its tones, in pixels from the centroid of the window.
 
     Attributes
     ----------
@@ -178,34 +168,25 @@ def chess_lattice(picture: Picture, matrix: Array, noise_variance: float) -> Ton
     orders = _TONES[below_nyquist]
     tones = measure(picture, waves[below_nyquist])
 
-    wu2, wv2 = picture.window_u.astype(float) ** 2, picture.window_v.astype(float) ** 2
     power = np.abs(tones.transform) ** 2
-    noise_power = max(noise_variance, 1e-12) * wu2.sum() * wv2.sum()
+    noise_power = max(noise_variance, 1e-12) * picture.noise_moments[2, 2]
     # sign of the amplitude: positive for (n, -m), negative for (n, m), n and m > 0
     expected = np.pi * orders @ matrix[:, 2] + np.where(orders[:, 1] > 0, np.pi, 0.0)
     error = np.angle(tones.transform * np.exp(-1j * expected))
     error = np.mod(error + np.pi / 2, np.pi) - np.pi / 2  # defocus may invert a harmonic
-    used = (power > _HARMONIC_SIGNIFICANCE**2 * noise_power) & (
-        np.abs(error) < _HARMONIC_TOLERANCE
-    )
+    used = (power > _HARMONIC_SIGNIFICANCE**2 * noise_power) & (np.abs(error) < _HARMONIC_TOLERANCE)
     used[:2] = True
     orders, weight = orders[used], 2 * power[used] / noise_power
     step, inverse = combine(orders, weight, error[used], tones.offset[used])
 
-    covariance = np.zeros((6, 6))
-    variances = window_variance(picture)
-    spread = (
-        (wu2 * picture.u_px**2).sum() / wu2.sum() / variances[0] ** 2,
-        (wv2 * picture.v_px**2).sum() / wv2.sum() / variances[1] ** 2,
-        1.0,
-    )
-    for column in range(3):
-        covariance[np.ix_([column, column + 3], [column, column + 3])] = inverse * spread[column]
-    window_sum = float(picture.window_u.sum(dtype=float) * picture.window_v.sum(dtype=float))
-    amplitude = 2 * np.abs(tones.transform[used]) / window_sum
+    # (wave vector, phase) from the moments, whose noise is correlated if the window is lopsided
+    solve = np.eye(3)
+    solve[:2, :2] = np.linalg.inv(picture.variance)
+    spread = solve @ (picture.noise_moments / picture.noise_moments[2, 2]) @ solve.T
+    amplitude = 2 * np.abs(tones.transform[used]) / picture.total
     return ToneLattice(
         matrix=matrix + step,
-        covariance=covariance,
+        covariance=np.kron(inverse, spread),
         orders=orders,
         weight=weight,
         blur_px=_blur(orders, tones.wave[used], amplitude),
@@ -219,8 +200,7 @@ def combine(
     """Weighted least squares over tones for a change of the lattice's matrix.
 
     Tone (n, m) measures the combination n p0 + m q0 of the phases and n grad p + m grad q of
-    the wave vectors. White noise makes the errors of different tones independent, and those of
-    phases and wave vectors too (symmetric window).
+    the wave vectors. White noise makes the errors of different tones independent.
 
     Parameters
     ----------
@@ -237,10 +217,10 @@ def combine(
     covariance : ndarray, shape (2, 2)
         Of the last column of `step`, if `weight` is the inverse variance of the phases.
     """
-    inverse = np.linalg.inv((weight[:, None] * orders).T @ orders)
+    inverse: Array = np.linalg.inv((weight[:, None] * orders).T @ orders)
     values = np.column_stack([wave, phase])
     step: Array = inverse @ (orders.T @ (weight[:, None] * values)) / np.pi
-    return step, inverse / np.pi**2
+    return step, np.asarray(inverse / np.pi**2)
 
 
 def _blur(orders: NDArray[np.int64], waves: Array, amplitude: Array) -> float:
