@@ -72,6 +72,12 @@ def test_table_with_positions_and_errors(images):
     assert result.stderr == ""
 
 
+def test_the_folder_is_named_once(images):
+    output = rasnik("analyse", images, *INSTRUMENT).stdout
+    assert output.count(str(images)) == 1
+    assert f"images in {images}" in output
+
+
 def test_json_lines_and_nothing_else(images):
     result = rasnik("analyse", images, *INSTRUMENT, "--json")
     assert result.exit_code == 0
@@ -190,6 +196,24 @@ def test_images_without_a_mask_say_so(tmp_path, image, flag):
     assert flag in record["flags"]
     assert record["x_um"] is None
     assert len(record["error"]) > 20
+
+
+def test_fields_of_too_few_pixels(tmp_path):
+    system = load_system(SYSTEM, {"mask.field_um": 15.0, "optics.blur_um": 2.0})
+    frame, _ = simulate(system, (2000.0, 1500.0), seed=1)[0]
+    Image.fromarray(frame).save(tmp_path / "a.png")
+    arguments = ["--field-um", "15", "--pixel-um", "6.9", "--json"]
+    result = rasnik("analyse", tmp_path / "a.png", *arguments)
+    assert result.exit_code == 1
+    assert "fewer than 2.5 pixels" in json.loads(result.stdout)["error"]
+
+
+def test_a_mask_of_another_code(images):
+    """Read with 7 code bits, the 8 of the mask make no sense."""
+    arguments = [*INSTRUMENT, "--set", "mask.code_bits=7", "--json"]
+    result = rasnik("analyse", images / "f0.png", *arguments)
+    assert result.exit_code == 1
+    assert "number of code bits" in json.loads(result.stdout)["error"]
 
 
 def test_failures_show_in_the_table(tmp_path, images):

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.markup import escape
 
@@ -21,9 +21,7 @@ if TYPE_CHECKING:
     from rasnik.instrument import System
     from rasnik.io.results import ResultWriter
 
-_COLUMNS = ("x (µm)", "y (µm)", "theta (mrad)", "S", "or.", "chi2/ndf")
 _MOST_CANDIDATES = 4
-_WIDE = 110  # characters that all columns need; the last two are left out with fewer
 
 __all__ = ["Destination", "Options", "run_batch"]
 
@@ -274,7 +272,9 @@ def _progress(sources: list[Source]) -> Iterator[Callable[[], None]]:
 
 def _report(outcome: _Outcome, destination: Destination, as_table: bool) -> None:
     if as_table:
-        _print_table(outcome.rows)
+        from rasnik.cli.table import print_table
+
+        print_table(outcome.rows)
     console = messages()
     for error in outcome.errors:
         console.print(f"[red]{escape(error)}[/]")
@@ -287,44 +287,3 @@ def _report(outcome: _Outcome, destination: Destination, as_table: bool) -> None
     if destination.overlays is not None:
         summary += f"; overlays in {destination.overlays}"
     (output() if as_table else console).print(escape(summary))
-
-
-def _print_table(rows: list[tuple[Frame, Pose | None, str | None]]) -> None:
-    from rich.table import Table
-
-    console = output()
-    headings = list(_COLUMNS if console.width >= _WIDE else _COLUMNS[:-2])
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("image", overflow="fold")
-    for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("remarks", overflow="fold")
-    stacks = {frame.file for frame, _, _ in rows if frame.frame > 0}
-    for frame, pose, error in rows:
-        name = f"{frame.file}[{frame.frame}]" if frame.file in stacks else frame.file
-        cells = _cells(pose)[: len(headings)]
-        table.add_row(escape(name), *cells, escape(_remarks(frame, pose, error)))
-    console.print(table)
-    if any(pose is not None and pose.ok for _, pose, _ in rows):
-        console.print("(in parentheses: one standard deviation, in units of the last digit)")
-
-
-def _cells(pose: Pose | None) -> list[str]:
-    from rasnik.report.numbers import concise
-
-    if pose is None or not pose.ok:
-        return ["-"] * len(_COLUMNS)
-    return [
-        concise(pose.x_um, pose.sigma_x_um),
-        concise(pose.y_um, pose.sigma_y_um),
-        concise(1e3 * pose.theta_rad, 1e3 * pose.sigma_theta_rad),
-        concise(pose.scale, pose.sigma_scale),
-        str(pose.orientation),
-        f"{pose.chi2_ndf:.3f}",
-    ]
-
-
-def _remarks(frame: Frame, pose: Pose | None, error: str | None) -> str:
-    words: list[Any] = [] if error is None else ["FAILED"]
-    words += pose.flags.names if pose is not None else ["see below"]
-    return ", ".join([*words, *frame.notes])
