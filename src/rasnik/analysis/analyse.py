@@ -161,7 +161,9 @@ def _refined(
         result = fit(frame, start, model=model)
     except ValueError:
         return Pose(flags=flags | Flag.NOT_CONVERGED, method="likelihood")
-    moved = _motion_fields(frame, start.projection, result.state.projection)
+    # a first estimate is affine: where a tilted mask needs more, only its centre is right
+    centre_only = result.model == "projective"
+    moved = _motion_fields(frame, start.projection, result.state.projection, centre_only)
     if moved > _MOST_MOTION_FIELDS or result.explained < _LEAST_EXPLAINED or not result.converged:
         flags |= Flag.NOT_CONVERGED
     return replace(
@@ -245,10 +247,13 @@ def _from_prior(
 # --------------------------------------------------------------------- results
 
 
-def _motion_fields(frame: Frame, before: Projection, after: Projection) -> float:
-    """Largest motion of the pattern at the corners and the centre of the image, in fields."""
-    u, v = frame.camera.corners_um
-    u, v = np.append(u, 0.0), np.append(v, 0.0)
+def _motion_fields(
+    frame: Frame, before: Projection, after: Projection, centre_only: bool = False
+) -> float:
+    """Largest motion of the pattern at the centre and the corners of the image, in fields."""
+    u, v = (np.append(0.0, corners) for corners in frame.camera.corners_um)
+    if centre_only:
+        u, v = u[:1], v[:1]
     (x0, y0), (x1, y1) = before.to_mask(u, v), after.to_mask(u, v)
     return float(np.hypot(x1 - x0, y1 - y0).max() / frame.mask.field_um)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rasnik.analysis.flags import Flag
 from rasnik.analysis.moments import Moments, all_tiles, gather
 from rasnik.analysis.outliers import estimate_noise, find_outliers
-from rasnik.analysis.parameters import POSE_SIZE, Model, State, design, stepped
+from rasnik.analysis.parameters import KURTOSIS_RANGE, POSE_SIZE, Model, State, design, stepped
 from rasnik.imaging.appearance import Camera
 from rasnik.imaging.kernels import TILE
 from rasnik.imaging.model import MIN_BLUR_PX, expected_image, make_scene
@@ -32,10 +32,10 @@ __all__ = ["Fit", "Frame", "fit", "residual_image"]
 #: leaves grows as its cube and is a few picometres for 85 um fields.
 LAST_STEP_FIELDS = 1.2e-3
 
-#: Decrease of chi-square (per unit of misfit) for which parameters are added.
-DEMANDED_GAIN = 30.0
+#: Decrease of chi-square for which parameters are added to the fit of a clean image.
+DEMANDED_GAIN = 20.0
 
-_COARSE_TILES = 240
+_COARSE_TILES = 150
 _CLUSTER_TILES = 3
 _MAX_STEP_FIELDS = 0.2
 
@@ -164,7 +164,7 @@ def fit(
     elif frame.noise is None:
         noise = estimate_noise(frame.image, frame.valid, solution.state, frame.mask, frame.camera)
         solution = _iterate(frame, noise, solution.state, chosen, False, tiles, 3)
-    chosen, kurtosis, solution = _add_what_is_needed(frame, noise, solution, chosen, model)
+    chosen, kurtosis, noise, solution = _add_what_is_needed(frame, noise, solution, chosen, model)
     if kurtosis:
         flags |= Flag.PROFILE_REFINED
     if solution.chi2_ndf > 1.15:
@@ -350,27 +350,56 @@ def _add_what_is_needed(
     solution: _Solution,
     chosen: Model,
     model: Model | Literal["auto"],
-) -> tuple[Model, bool, _Solution]:
-    """Add parameters while the data demand them (score tests at the present solution)."""
+) -> tuple[Model, bool, tuple[float, float], _Solution]:
+    """Add parameters while the data demand them (score tests at the present solution).
+
+    They stay only if the fit with them converges to something that makes sense.
+    """
     tiles = all_tiles(frame.camera.shape)
     kurtosis = False
-    for _ in range(3):
-        options: list[tuple[Model, bool]] = []
-        if model == "auto" and chosen == "similarity":
-            options.append(("affine", kurtosis))
-        if model == "auto" and chosen == "affine":
-            options.append(("projective", kurtosis))
-        if not kurtosis:
-            options.append((chosen, True))
+    refused: set[tuple[Model, bool]] = set()
+    for _ in range(4):
+        options: list[tuple[Model, bool]] = [] if kurtosis else [(chosen, True)]
+        if model == "auto" and chosen != "projective":
+            options.append(("affine" if chosen == "similarity" else "projective", kurtosis))
+        options = [option for option in options if option not in refused]
         gains = [_gain(frame, solution, *option) for option in options]
-        # dirt and distortion make chi-square fall for no reason; not more than they scatter
-        growth = _scatter_growth(solution, _inverse(solution.normal), frame.camera)
-        inflation = max(1.0, solution.chi2_ndf, float((growth**2).max()))
-        if not gains or max(gains) < DEMANDED_GAIN * inflation:
+        if not gains or max(gains) < DEMANDED_GAIN * max(1.0, solution.chi2_ndf):
             break
-        chosen, kurtosis = options[int(np.argmax(gains))]
-        solution = _iterate(frame, noise, solution.state, chosen, kurtosis, tiles, 6)
-    return chosen, kurtosis, solution
+        best = options[int(np.argmax(gains))]
+        trial = _iterate(frame, noise, solution.state, *best, tiles, 8)
+        if _makes_sense(solution, trial) and max(gains) > _demanded(trial, frame.camera):
+            (chosen, kurtosis), solution = best, trial
+            if frame.noise is None:
+                state = solution.state
+                noise = estimate_noise(frame.image, frame.valid, state, frame.mask, frame.camera)
+                solution = _iterate(frame, noise, state, chosen, kurtosis, tiles, 3)
+        else:
+            refused.add(best)
+    return chosen, kurtosis, noise, solution
+
+
+def _demanded(trial: _Solution, camera: Camera) -> float:
+    """By how much chi-square must fall for more parameters to be believed.
+
+    Dirt and distortion that are still there make it fall for no reason, the more so the more
+    they scatter the parts of the image.
+    """
+    growth = _scatter_growth(trial, _inverse(trial.normal), camera)
+    inflation = max(trial.chi2_ndf, float((growth**2).max()))
+    return DEMANDED_GAIN + 3 * DEMANDED_GAIN * max(0.0, inflation - 1.5)
+
+
+def _makes_sense(before: _Solution, after: _Solution) -> bool:
+    """Whether a richer model still describes one edge, seen less than half as sharp."""
+    old, new = before.state.appearance, after.state.appearance
+    low, high = KURTOSIS_RANGE
+    return (
+        after.converged
+        and after.chi2 < before.chi2
+        and low < new.kurtosis < high
+        and new.blur_um < 1.5 * old.blur_um
+    )
 
 
 def _gain(frame: Frame, solution: _Solution, model: Model, kurtosis: bool) -> float:

@@ -31,7 +31,7 @@ from rasnik.analysis.moments import (
 from rasnik.imaging.appearance import Appearance, Camera
 from rasnik.imaging.projection import Projection
 
-__all__ = ["POSE_SIZE", "Model", "State", "design", "stepped"]
+__all__ = ["KURTOSIS_RANGE", "POSE_SIZE", "Model", "State", "design", "stepped"]
 
 Model = Literal["similarity", "affine", "projective"]
 
