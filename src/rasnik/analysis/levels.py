@@ -13,7 +13,7 @@ __all__ = ["Levels", "fit_levels", "neighbour_sums", "quadratic_basis", "safe_ha
 
 Array = NDArray[np.float64]
 
-_MOST_FIELDS_FITTED = 2000
+_MOST_FIELDS_FITTED = 1500
 _PASSES = 5
 # A field counts little beyond this many times the scatter, or this part of the contrast.
 _TOLERANCE = 3.0
@@ -131,7 +131,8 @@ def _surfaces(basis: Array, mixed: Array, grey: Array, weight: Array) -> tuple[A
     """Weighted least squares for the coefficients of middle and half."""
     design = np.hstack([basis, basis * mixed[:, None]])
     weighted = design * weight[:, None]
-    solution: Array = np.linalg.lstsq(weighted.T @ design, weighted.T @ grey, rcond=1e-10)[0]
+    found = np.linalg.lstsq(weighted.T @ design, weighted.T @ grey, rcond=1e-10)[0]
+    solution = np.asarray(found, np.float64)
     return solution[:6], solution[6:]
 
 
