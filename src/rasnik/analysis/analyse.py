@@ -38,6 +38,7 @@ _PRIOR_MOTION_FIELDS = 0.8
 _LEAST_EXPLAINED = 0.5
 _PRIOR_EXPLAINED = 0.9
 _HEAVILY_MASKED = 0.25
+_SCALE_TOLERANCE = np.log(1.2)
 _FATAL = Flag(sum(info.flag for info in FLAGS if info.fatal))
 
 
@@ -104,9 +105,9 @@ def analyse(
     if prior is not None and prior.ok and method == "likelihood":
         pose = _from_prior(frame, prior, model, flags)
         if pose is not None:
-            return pose
+            return _with_scale_checked(pose, loaded)
         flags |= Flag.PRIOR_REJECTED
-    lattice = find_lattice(frame.image, pitch, _as_mask(frame))
+    lattice = find_lattice(frame.image, pitch, _picture_mask(frame))
     if isinstance(lattice, Flag):
         return Pose(flags=flags | lattice)
     decoding = decode(read_fields(lattice), lattice, mask, orientation)
@@ -116,7 +117,19 @@ def analyse(
         return _undecided(lattice, decoding, flags)
     if method == "fourier":
         raise NotImplementedError
-    return _refined(frame, lattice, decoding, decoding.best, model, flags)
+    pose = _refined(frame, lattice, decoding, decoding.best, model, flags)
+    return _with_scale_checked(pose, loaded)
+
+
+def _with_scale_checked(pose: Pose, system: System | None) -> Pose:
+    """The pose, flagged if its scale is not the system's: the mask may be another one."""
+    if (
+        system is None
+        or not pose.ok
+        or abs(np.log(pose.scale / system.optics.scale)) < _SCALE_TOLERANCE
+    ):
+        return pose
+    return replace(pose, flags=pose.flags | Flag.SCALE_UNEXPECTED)
 
 
 def _check_options(method: str, model: str, orientation: int | None) -> None:
@@ -139,8 +152,8 @@ def _with_polarity(frame: Frame, polarity: str) -> Frame:
     return replace(frame, mask=frame.mask.model_copy(update={"polarity": polarity}))
 
 
-def _as_mask(frame: Frame) -> NDArray[np.bool_] | None:
-    return None if frame.valid.all() else frame.valid > 0
+def _picture_mask(frame: Frame) -> NDArray[np.bool_] | None:
+    return None if frame.picture.all() else frame.picture > 0
 
 
 # --------------------------------------------------------------------- from nothing

@@ -32,6 +32,7 @@ class Flag(IntFlag):
     NOT_FINITE = 1 << 14
     PRIOR_REJECTED = 1 << 15
     LOW_CONTRAST = 1 << 16
+    SCALE_UNEXPECTED = 1 << 17
 
     @property
     def names(self) -> list[str]:
@@ -157,5 +158,12 @@ FLAGS: tuple[FlagInfo, ...] = (
         False,
         "The fields differ by less than five times the noise of a pixel.",
         "Raise the light, improve the focus.",
+    ),
+    FlagInfo(
+        Flag.SCALE_UNEXPECTED,
+        False,
+        "The scale differs from the system's by more than 20 %. If the mask has another field "
+        "size than the system says, the position is wrong by the same factor.",
+        "Check mask.field_um, sensor.pixel_um, sensor.binning and optics.scale.",
     ),
 )

@@ -68,8 +68,8 @@ def _picture(shape: tuple[int, int], bounds: Bounds | None) -> NDArray[np.uint8]
 def _full_scale(image: NDArray[np.generic], system: System | None) -> float | None:
     if system is not None:
         return float(system.full_scale)
-    if np.issubdtype(image.dtype, np.integer):
-        return float(np.iinfo(image.dtype).max)
+    if image.dtype.kind in "iu":
+        return float(2 ** (8 * image.dtype.itemsize - (image.dtype.kind == "i")) - 1)
     return None
 
 
@@ -138,10 +138,11 @@ def prepare_frame(
             flags |= Flag.NOT_FINITE
             valid[~finite] = 0
             grey = np.where(finite, grey, np.float32(0.0))
+    picture = valid.copy()
     full = _full_scale(array, system)
     if full is not None and _leave_out_saturated(grey >= full, valid):
         flags |= Flag.SATURATED
     noise = None if system is None else system.noise_law
     if noise is not None and np.issubdtype(array.dtype, np.integer):
         noise = (noise[0] + _ROUNDING_VARIANCE, noise[1])
-    return Frame(grey, valid, Camera(array.shape, pixel_um), mask, noise), flags
+    return Frame(grey, valid, picture, Camera(array.shape, pixel_um), mask, noise), flags

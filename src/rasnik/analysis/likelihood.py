@@ -49,6 +49,8 @@ class Frame:
     image : ndarray of float32, shape (H, W)
     valid : ndarray of uint8, shape (H, W)
         1 where a pixel may be used.
+    picture : ndarray of uint8, shape (H, W)
+        1 where there is picture at all, saturated or not.
     camera : Camera
     mask : ChessField
     noise : tuple of float or None
@@ -57,6 +59,7 @@ class Frame:
 
     image: NDArray[np.float32]
     valid: NDArray[np.uint8]
+    picture: NDArray[np.uint8]
     camera: Camera
     mask: ChessField
     noise: tuple[float, float] | None
@@ -264,6 +267,7 @@ def _iterate(
         if best is not None and per_pixel > 1.05 * best.moments.chi2 / best.moments.n_pixels:
             damping *= 0.3
             if damping < 0.02:
+                best = replace(best, state=best_start, converged=False)
                 break
             state = stepped(best_start, damping * best.step, model, min_blur, kurtosis)
             continue
@@ -272,7 +276,13 @@ def _iterate(
         state = stepped(state, fraction * step, model, min_blur, kurtosis)
         still = _motion_fields(best_start, step, frame) < LAST_STEP_FIELDS
         best = _Solution(
-            state, rows, normal, fraction * step, moments, moments.chi2 - gradient @ step, still
+            state,
+            rows,
+            normal,
+            fraction * step,
+            moments,
+            moments.chi2 - float(gradient @ step),
+            still,
         )
         variance = best_start.appearance.blur_um**2
         if still and abs(step[POSE_SIZE[model] + 12]) < 0.02 * variance:

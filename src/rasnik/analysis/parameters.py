@@ -104,7 +104,8 @@ def stepped(
 ) -> State:
     """The state after a step in the parameters of `design`.
 
-    The blur changes by at most a factor of 1.5 in sigma; the excess kurtosis stays in `KURTOSIS_RANGE`.
+    The blur changes by at most a factor of 1.5 in sigma; the excess kurtosis stays in
+    `KURTOSIS_RANGE`.
     """
     n_pose = POSE_SIZE[model]
     projection = _moved(state.projection, step[:n_pose])

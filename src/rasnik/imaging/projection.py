@@ -45,7 +45,9 @@ def sensor_grid_um(
     """
     height, width = shape
     column, row = reference_px or ((width - 1) / 2, (height - 1) / 2)
-    return (np.arange(width) - column) * pixel_um, (np.arange(height) - row) * pixel_um
+    u = (np.arange(width, dtype=np.float64) - column) * pixel_um
+    v = (np.arange(height, dtype=np.float64) - row) * pixel_um
+    return u, v
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +159,8 @@ class Projection:
         self, x_um: ArrayLike, y_um: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Sensor coordinates (u, v) in um of mask points; arguments broadcast."""
-        return Projection(np.linalg.inv(self.matrix)).to_mask(x_um, y_um)
+        inverse = np.asarray(np.linalg.inv(self.matrix), dtype=np.float64)
+        return Projection(inverse).to_mask(x_um, y_um)
 
     def exchanged(self) -> Projection:
         """The same image read with mask x and y exchanged (codes look alike)."""
