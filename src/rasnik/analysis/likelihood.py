@@ -36,6 +36,7 @@ LAST_STEP_FIELDS = 1.2e-3
 DEMANDED_GAIN = 20.0
 
 _COARSE_TILES = 150
+_NEGLIGIBLE = 0.05
 _CLUSTER_TILES = 3
 _MAX_STEP_FIELDS = 0.2
 
@@ -274,7 +275,7 @@ def _iterate(
         damping = 1.0
         best_start = state
         state = stepped(state, fraction * step, model, min_blur, kurtosis)
-        still = _motion_fields(best_start, step, frame) < LAST_STEP_FIELDS
+        still = _is_last(best_start, step, normal, frame)
         best = _Solution(
             state,
             rows,
@@ -316,6 +317,22 @@ def _motion_fields(state: State, step: NDArray[np.float64], frame: Frame) -> flo
         np.abs(step[2:6]).sum() if len(step) >= POSE_SIZE["affine"] + 14 else np.hypot(*step[2:4])
     )
     return float((np.hypot(*step[:2]) + reach * turn) / frame.mask.field_um)
+
+
+def _is_last(
+    state: State, step: NDArray[np.float64], normal: NDArray[np.float64], frame: Frame
+) -> bool:
+    """Whether what a step leaves undone is below a twentieth of the error.
+
+    The cubic part of the error is known from the motion; the linear part is the share of the
+    information that tiles neglect by taking monomials as constant.
+    """
+    neglected = (TILE / min(frame.camera.shape)) ** 2
+    sigma = 1 / np.sqrt(np.maximum(np.diag(normal)[:4], 1e-300))
+    return bool(
+        _motion_fields(state, step, frame) < LAST_STEP_FIELDS
+        and (np.abs(step[:4]) * neglected < _NEGLIGIBLE * sigma).all()
+    )
 
 
 def _shears_needed(solution: _Solution) -> bool:

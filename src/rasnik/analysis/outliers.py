@@ -41,6 +41,14 @@ def _spread(values: NDArray[np.float32]) -> float:
     return float(_MAD * np.median(np.abs(values)))
 
 
+def _clipped_variance(values: NDArray[np.float32]) -> float:
+    """Variance without what is beyond 4 sigma (medians fail on noise of a grey level)."""
+    for _ in range(4):
+        centre, sigma = float(values.mean()), float(values.std())
+        values = values[np.abs(values - centre) <= 4 * sigma]
+    return float(values.var())
+
+
 def find_outliers(
     image: NDArray[np.float32],
     valid: NDArray[np.uint8],
@@ -113,12 +121,12 @@ def estimate_noise(
     edges = np.quantile(g, np.linspace(0, 1, 9))
     bins = np.clip(np.searchsorted(edges, g) - 1, 0, 7)
     points = [
-        (g[bins == k].mean(), _spread(r[bins == k] - np.median(r[bins == k])) ** 2)
+        (float(g[bins == k].mean()), _clipped_variance(r[bins == k]))
         for k in range(8)
         if np.count_nonzero(bins == k) > 30
     ]
     if len(points) < 2:
-        return max(_spread(r) ** 2, 1e-6), 0.0
+        return max(_clipped_variance(r), 1e-6), 0.0
     levels, variances = np.array(points).T
     levels = np.maximum(levels, 0.0)
     (a, b), _ = optimize.nnls(np.stack([np.ones_like(levels), levels], axis=1), variances)
