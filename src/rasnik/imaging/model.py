@@ -108,7 +108,7 @@ def make_scene(
         fields,
         i0,
         j0,
-        (0,) * (2 * reach),
+        reach,
     )
 
 
