@@ -16,11 +16,12 @@ from numpy.typing import NDArray
 from rasnik.analysis.decode import Decoding, LabelledLattice, decode
 from rasnik.analysis.flags import FLAGS, Flag
 from rasnik.analysis.fourier import find_lattice
+from rasnik.analysis.fourier_pose import fourier_pose
 from rasnik.analysis.frame import Bounds, prepare_frame, resolve_instrument
 from rasnik.analysis.lattice import Lattice
 from rasnik.analysis.likelihood import Fit, Frame, fit
 from rasnik.analysis.parameters import Model, State
-from rasnik.analysis.pose import Candidate, Pose
+from rasnik.analysis.pose import Pose
 from rasnik.analysis.readout import read_fields
 from rasnik.imaging.appearance import Appearance
 from rasnik.imaging.model import MIN_BLUR_PX
@@ -113,10 +114,9 @@ def analyse(
     decoding = decode(read_fields(lattice), lattice, mask, orientation)
     decoding = _settled_by_prior(decoding, prior, mask.field_um)
     flags |= decoding.flags
-    if not decoding.ok or decoding.best is None:
-        return _undecided(lattice, decoding, flags)
-    if method == "fourier":
-        raise NotImplementedError
+    if method == "fourier" or not decoding.ok or decoding.best is None:
+        pose = fourier_pose(lattice, decoding, mask)
+        return _with_scale_checked(replace(pose, flags=pose.flags | flags), loaded)
     pose = _refined(frame, lattice, decoding, decoding.best, model, flags)
     return _with_scale_checked(pose, loaded)
 
@@ -182,26 +182,6 @@ def _refined(
     return replace(
         _pose(frame, result, best.orientation, flags),
         polarity=best.polarity,
-        code_lines_read=decoding.lines_read,
-        code_lines_in_view=decoding.lines_in_view,
-    )
-
-
-def _undecided(lattice: Lattice, decoding: Decoding, flags: Flag) -> Pose:
-    """No position: what else is known, and the candidates."""
-    candidates = []
-    for one in decoding.candidates:
-        scale, theta, _ = one.projection.similarity(one.orientation)
-        projection = one.projection
-        candidates.append(
-            Candidate(projection.x_um, projection.y_um, scale, theta, one.orientation, one.log_odds)
-        )
-    return Pose(
-        flags=flags,
-        candidates=tuple(candidates) if flags & Flag.AMBIGUOUS else (),
-        blur_um=lattice.blur_um,
-        dark_level=float(lattice.dark[0]),
-        light_level=float(lattice.light[0]),
         code_lines_read=decoding.lines_read,
         code_lines_in_view=decoding.lines_in_view,
     )
