@@ -38,14 +38,14 @@ class Coverage:
     agreement : float
         Part of these fields that are brighter or darker than their neighbours as the chessboard
         demands; 0.5 by chance.
-    significance : float
-        By how many standard deviations that beats chance.
+    judged : int
+        Number of these fields.
     """
 
     fields: NDArray[np.bool_]
     fraction: float
     agreement: float
-    significance: float
+    judged: int
 
 
 def coverage(samples: FieldSamples) -> Coverage:
@@ -59,7 +59,7 @@ def coverage(samples: FieldSamples) -> Coverage:
         there[1:-1, 1:-1] & there[:-2, 1:-1] & there[2:, 1:-1] & there[1:-1, :-2] & there[1:-1, 2:]
     )
     if whole.sum() < 9:
-        return Coverage(there & False, 0.0, 0.0, 0.0)
+        return Coverage(there & False, 0.0, 0.0, 0)
     contrast = np.zeros_like(grey)
     around = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:]
     contrast[1:-1, 1:-1] = (grey[1:-1, 1:-1] - around / 4) * samples.chess[1:-1, 1:-1]
@@ -76,7 +76,7 @@ def coverage(samples: FieldSamples) -> Coverage:
         fields=fields,
         fraction=float(fields.sum() / there.sum()),
         agreement=agreement,
-        significance=(agreement - 0.5) * 2 * math.sqrt(count),
+        judged=count,
     )
 
 

@@ -31,7 +31,9 @@ LEAST_MARGIN = LLR_BOUND_BRIGHT + 0.5
 _WINDOW = 30.0
 _MOST_CANDIDATES = 16
 # A plain chessboard, or another code, makes hardly any position better than no code at all,
-# leaves inversions unexplained and predicts ones that are not seen.
+# leaves inversions unexplained and predicts ones that are not seen. A position needs more
+# evidence than the suspicion of one.
+_SOME_EVIDENCE = 15.0
 _LEAST_EVIDENCE = 25.0
 _LEAST_EXPLAINED = 0.5
 _LEAST_SEEN = 0.75
@@ -164,7 +166,7 @@ def decode(
     if orientation not in (None, 1, 2, 3, 4):
         raise ValueError(f"orientation must be 1, 2, 3 or 4, not {orientation!r}")
     found = _search(labellings(lattice.matrix, readout, orientation), mask)
-    if not found or found[0].score < _LEAST_EVIDENCE:
+    if not found or found[0].score < _SOME_EVIDENCE:
         return Decoding(Flag.NO_CODE, readout=readout)
     best = found[0]
     candidates = tuple(_labelled(one, best.score, mask) for one in found[:_MOST_CANDIDATES])
@@ -173,7 +175,7 @@ def decode(
     flags = Flag.NONE
     if not plausible:
         flags |= Flag.NO_CODE
-    elif margin < least_margin:
+    elif margin < least_margin or best.score < _LEAST_EVIDENCE:
         flags |= Flag.AMBIGUOUS
     if orientation is None and abs(best.labelling.theta_rad) > _QUARTER_TURN_RAD:
         flags |= Flag.QUARTER_TURN

@@ -40,11 +40,12 @@ _PAIRS_TRIED = 10
 # Primaries of a square pattern are equal and perpendicular; a slanted view changes both.
 _MOST_LENGTH_RATIO = 1.7
 _LEAST_SINE = math.sin(math.radians(55))
-# A lattice is accepted at once above the first, and at all above the second agreement ...
+# A lattice is accepted at once above the first, and at all above the second agreement, the
+# latter raised by this / sqrt(number of fields), since among few fields chance goes far ...
 _GOOD_AGREEMENT = 0.80
 _LEAST_AGREEMENT = 0.75
-# ... if that is this many standard deviations away from chance and covers this much of the view.
-_LEAST_SIGNIFICANCE = 5.0
+_CHANCE = 0.7
+# ... if it covers this much of the view.
 _LEAST_COVERAGE = 0.12
 # Below this coverage the transform is repeated over the part that shows the mask.
 _WHOLE_COVERAGE = 0.93
@@ -126,9 +127,9 @@ class _Trial:
 
     def agrees(self, least: float) -> bool:
         """Whether the fields show the chessboard that the lattice says."""
+        chance = _CHANCE / math.sqrt(max(self.seen.judged, 1))
         return (
-            self.seen.agreement > least
-            and self.seen.significance > _LEAST_SIGNIFICANCE
+            self.seen.agreement > max(least, _LEAST_AGREEMENT + chance)
             and self.seen.fraction > _LEAST_COVERAGE
         )
 
@@ -298,7 +299,7 @@ def _finish(
     matrix[:, :2] /= pixel_um
     pixels_per_field = 1 / (math.sqrt(abs(np.linalg.det(matrix[:, :2]))) * pixel_um)
     if pixels_per_field < LEAST_PIXELS_PER_FIELD:
-        return Flag.FIELD_TOO_SMALL
+        return Flag.FIELD_TOO_SMALL if trial.agrees(_GOOD_AGREEMENT) else Flag.NO_MASK
     samples = replace(trial.samples, present=trial.seen.fields)
     levels = fit_levels(samples)
     if levels is None:

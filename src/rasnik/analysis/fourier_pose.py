@@ -16,7 +16,7 @@ from rasnik.analysis.flags import Flag
 from rasnik.analysis.lattice import Lattice
 from rasnik.analysis.levels import quadratic_basis
 from rasnik.analysis.pose import Candidate, Pose
-from rasnik.analysis.tones import combine
+from rasnik.analysis.tones import combine, measure, phase_errors
 from rasnik.imaging.projection import Projection
 from rasnik.mask import ChessField
 
@@ -24,15 +24,17 @@ __all__ = ["fourier_pose"]
 
 Array = NDArray[np.float64]
 
+_PASSES = 2
+
 
 def fourier_pose(
     lattice: Lattice | Flag,
     decoding: Decoding | None,
     mask: ChessField,
-    orientation: int | None = None,
 ) -> Pose:
-    """Pose with ``method="fourier"``.
+    """Pose with ``method="fourier"`` and ``model="similarity"``.
 
+    Scale and rotation are the mean ones of the affine map found; `Pose.projection` is that map.
     The covariance covers white pixel noise (`Lattice.noise_variance`) only: neither distortion
     nor unequal scales, of which the pose gives the mean.
 
@@ -43,8 +45,6 @@ def fourier_pose(
     decoding : Decoding or None
         Result of `decode`; None if there is no lattice.
     mask : ChessField
-    orientation : int, optional
-        As given to `decode`.
 
     Returns
     -------
@@ -56,7 +56,7 @@ def fourier_pose(
     if decoding is None or decoding.best is None:
         return Pose(flags=Flag.NO_CODE if decoding is None else decoding.flags)
     candidates = (
-        tuple(_candidate(one, orientation) for one in decoding.candidates)
+        tuple(_candidate(one) for one in decoding.candidates)
         if decoding.flags & Flag.AMBIGUOUS
         else ()
     )
@@ -91,7 +91,7 @@ def fourier_pose(
     )
 
 
-def _candidate(one: LabelledLattice, orientation: int | None) -> Candidate:
+def _candidate(one: LabelledLattice) -> Candidate:
     scale, theta, code = one.projection.similarity(one.orientation)
     return Candidate(
         x_um=one.projection.x_um,
@@ -105,19 +105,40 @@ def _candidate(one: LabelledLattice, orientation: int | None) -> Candidate:
 
 def _without_code(lattice: Lattice, best: LabelledLattice, mask: ChessField) -> Projection:
     """The map from sensor to mask with the effect of the inverted fields taken out."""
-    step = code_step(lattice, best, mask)
-    matrix = best.projection.matrix.copy()
-    matrix[:2] -= mask.field_um * best.change @ step
-    return Projection(matrix)
+    phase, offset = code_effect(lattice, best, mask)
+    picture, orders = lattice.picture, lattice.tones.orders
+    start = lattice.tones.matrix
+    matrix = start
+    for _ in range(_PASSES):
+        tones = measure(picture, np.pi * orders @ matrix[:, :2])
+        error = phase_errors(tones, orders, matrix) - phase
+        step, _ = combine(orders, lattice.tones.weight, error, tones.offset - offset)
+        matrix = matrix + step
+    # from pixels about the window's centroid to micrometres about the image's centre
+    change = matrix - start
+    height, width = lattice.shape
+    column, row = picture.centroid_px
+    change[:, 2] += change[:, :2] @ [(width - 1) / 2 - column, (height - 1) / 2 - row]
+    change[:, :2] /= lattice.pixel_um
+    refined = best.projection.matrix.copy()
+    refined[:2] += mask.field_um * best.change @ change
+    return Projection(refined)
 
 
-def code_step(lattice: Lattice, best: LabelledLattice, mask: ChessField) -> Array:
-    """By how much the inverted fields change the lattice's matrix, shape (2, 3).
+def code_effect(lattice: Lattice, best: LabelledLattice, mask: ChessField) -> tuple[Array, Array]:
+    """What the inverted fields do to the tones: see `Tones`.
 
     A field at c contributes s (W(c) + i grad W(c) . grad log T) T(k) exp(-i k . c) to the
     transform at k, W being window times contrast, T(k) the transform of a blurred field and s its
     colour. At the tones s exp(-i k . c) is the same for all plain fields and opposite for inverted
     ones: without gradients of W, they would make the tones weaker and not shift them at all.
+
+    Returns
+    -------
+    phase : ndarray, shape (n,)
+        Change of the phases of `ToneLattice.orders`, radians.
+    offset : ndarray, shape (n, 2)
+        Change of the wave vectors as `measure` sees them, radians per pixel.
     """
     u, v = _inverted_fields(lattice, best, mask)
     here, by_u, by_v = _weight_and_slopes(lattice, u, v)
@@ -147,15 +168,7 @@ def code_step(lattice: Lattice, best: LabelledLattice, mask: ChessField) -> Arra
         - 2j * (slope_u * (v * by_u).sum() + slope_v * (here + v * by_v).sum())
     )
     moments = np.column_stack([(moment_u / transform).imag, (moment_v / transform).imag])
-    step, _ = combine(
-        orders, lattice.tones.weight, np.angle(transform), moments @ np.linalg.inv(picture.variance)
-    )
-    # from pixels about the window's centroid to micrometres about the image's centre
-    height, width = lattice.shape
-    column, row = picture.centroid_px
-    step[:, 2] += step[:, :2] @ [(width - 1) / 2 - column, (height - 1) / 2 - row]
-    step[:, :2] /= lattice.pixel_um
-    return step
+    return np.angle(transform), moments @ np.linalg.inv(picture.variance)
 
 
 def _inverted_fields(

@@ -193,10 +193,7 @@ def chess_lattice(picture: Picture, matrix: Array, noise_variance: float) -> Ton
 
     power = np.abs(tones.transform) ** 2
     noise_power = max(noise_variance, 1e-12) * picture.noise_moments[2, 2]
-    # sign of the amplitude: positive for (n, -m), negative for (n, m), n and m > 0
-    expected = np.pi * orders @ matrix[:, 2] + np.where(orders[:, 1] > 0, np.pi, 0.0)
-    error = np.angle(tones.transform * np.exp(-1j * expected))
-    error = np.mod(error + np.pi / 2, np.pi) - np.pi / 2  # defocus may invert a harmonic
+    error = phase_errors(tones, orders, matrix)
     used = (power > _HARMONIC_SIGNIFICANCE**2 * noise_power) & (np.abs(error) < _HARMONIC_TOLERANCE)
     used[:2] = True
     orders, weight = orders[used], 2 * power[used] / noise_power
@@ -215,6 +212,15 @@ def chess_lattice(picture: Picture, matrix: Array, noise_variance: float) -> Ton
         blur_px=_blur(orders, tones.wave[used], amplitude),
         amplitude=float(np.sqrt(amplitude[0] * amplitude[1])),
     )
+
+
+def phase_errors(tones: Tones, orders: NDArray[np.int64], matrix: Array) -> Array:
+    """Phase of each tone minus what the lattice says, radians, within +-pi/2."""
+    # sign of the amplitude: positive for (n, -m), negative for (n, m), n and m > 0
+    expected = np.pi * orders @ matrix[:, 2] + np.where(orders[:, 1] > 0, np.pi, 0.0)
+    error = np.angle(tones.transform * np.exp(-1j * expected))
+    within: Array = np.mod(error + np.pi / 2, np.pi) - np.pi / 2  # defocus may invert a harmonic
+    return within
 
 
 def combine(
