@@ -12,8 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from rasnik.analysis.flags import Flag
-from rasnik.analysis.frame import prepare_frame
-from rasnik.analysis.likelihood import Fit, Frame, fit
+from rasnik.analysis.frame import Frame, prepare_frame
+from rasnik.analysis.likelihood import Fit, fit
 from rasnik.analysis.moments import all_tiles, gather
 from rasnik.analysis.outliers import estimate_noise
 from rasnik.analysis.parameters import POSE_SIZE, State, design, stepped
@@ -88,7 +88,7 @@ def test_the_step_is_the_change_of_parameters(rng) -> None:
     moved[20:23] = 0.1, 0.02, 2.0
     truth = stepped(state, moved, "projective", 1.0, True)
     image = expected_image(mask, truth.projection, truth.appearance, camera)
-    scene = make_scene(mask, state.projection, state.appearance, camera)
+    scene = make_scene(mask, state.projection, state.appearance, camera, kurtosis_signal=True)
     valid = np.ones(camera.shape, dtype=np.uint8)
     moments = gather(image, valid, scene, (0.3, 0.01), camera, all_tiles(camera.shape))
     rows = design(state, camera, mask.field_um, "projective", True)

@@ -175,7 +175,7 @@ def test_edge_shift_makes_black_larger_by_its_length() -> None:
 def test_one_corner_is_a_case_of_many() -> None:
     projection = Projection.from_pose(4017.0, 5011.0, 1.0, 0.1, 4)
     appearance = Appearance.uniform(20, 200, 4.5).with_(edge_shift_um=1.0, kurtosis=0.5)
-    scene = make_scene(MASK, projection, appearance, CAMERA)
+    scene = make_scene(MASK, projection, appearance, CAMERA, kurtosis_signal=True)
     assert scene.reach == 1
     wanted = np.arange(kernels.N_SIGNALS - 1)
     near = kernels.render(*CAMERA.shape, scene, wanted)
@@ -196,7 +196,7 @@ def test_products_are_sums_over_pixels(rng) -> None:
     image = (level + rng.normal(0, 2, level.shape)).astype(np.float32)
     valid = (rng.random(level.shape) < 0.9).astype(np.uint8)
     tiles = np.array([[0, 0], [2, 3], [4, 5]], dtype=np.int32)  # the last one is cut off
-    scene = make_scene(MASK, projection, appearance, CAMERA)
+    scene = make_scene(MASK, projection, appearance, CAMERA, kurtosis_signal=True)
     products, counts = tile_products(image, valid, scene, (0.3, 0.01), tiles)
     for (row, column), product, count in zip(tiles, products, counts, strict=True):
         here = slice(16 * row, 16 * row + 16), slice(16 * column, 16 * column + 16)

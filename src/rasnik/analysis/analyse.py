@@ -17,9 +17,9 @@ from rasnik.analysis.decode import Decoding, LabelledLattice, decode
 from rasnik.analysis.flags import FLAGS, Flag
 from rasnik.analysis.fourier import find_lattice
 from rasnik.analysis.fourier_pose import fourier_pose
-from rasnik.analysis.frame import Bounds, prepare_frame, resolve_instrument
+from rasnik.analysis.frame import Bounds, Frame, prepare_frame, resolve_instrument
 from rasnik.analysis.lattice import Lattice
-from rasnik.analysis.likelihood import Fit, Frame, fit
+from rasnik.analysis.likelihood import Fit, fit
 from rasnik.analysis.parameters import Model, State
 from rasnik.analysis.pose import Pose
 from rasnik.analysis.readout import read_fields

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
 from rasnik.analysis.flags import Flag
-from rasnik.analysis.likelihood import Frame
 from rasnik.imaging.appearance import Camera
 from rasnik.instrument import System, load_system
 from rasnik.mask import ChessField
 
-__all__ = ["Bounds", "prepare_frame", "resolve_instrument"]
+__all__ = ["Bounds", "Frame", "prepare_frame", "resolve_instrument"]
 
 #: (left, top, right, bottom) pixel of the picture, all four included.
 Bounds = tuple[int, int, int, int]
@@ -20,6 +21,31 @@ Bounds = tuple[int, int, int, int]
 _ROUNDING_VARIANCE = 1 / 12
 _SMALLEST_PX = 16
 _SATURATED_FRACTION = 0.10
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image as the fit takes it.
+
+    Attributes
+    ----------
+    image : ndarray of float32, shape (H, W)
+    valid : ndarray of uint8, shape (H, W)
+        1 where a pixel may be used.
+    picture : ndarray of uint8, shape (H, W)
+        1 where there is picture at all, saturated or not.
+    camera : Camera
+    mask : ChessField
+    noise : tuple of float or None
+        A and B of the pixel variance A + B g, rounding included; None if unknown.
+    """
+
+    image: NDArray[np.float32]
+    valid: NDArray[np.uint8]
+    picture: NDArray[np.uint8]
+    camera: Camera
+    mask: ChessField
+    noise: tuple[float, float] | None
 
 
 def resolve_instrument(

@@ -98,6 +98,9 @@ class Scene(NamedTuple):
         1 for white fields; i0, j0 is the index of the first.
     reach : int
         Number of fields felt on either side of a corner.
+    orders : int
+        Derivatives of the profile that are worked out: 4, or 5 if the signal of the kurtosis
+        is wanted (it is zero otherwise).
     """
 
     map: NDArray[np.float64]
@@ -116,6 +119,7 @@ class Scene(NamedTuple):
     i0: int
     j0: int
     reach: int
+    orders: int
 
 
 @_compiled
@@ -146,8 +150,8 @@ def locate(work, index, h, u0, v0, pixel, columns, rows):
 
 
 @_compiled
-def profiles(work, index, distance, out, table, limit, step, reach):
-    """E and four derivatives at every edge within reach: nearest entry plus Taylor."""
+def profiles(work, index, distance, out, table, limit, step, reach, orders):
+    """E and its derivatives at every edge within reach: nearest entry plus Taylor."""
     edges = 2 * reach - 1
     last = np.float32(table.shape[0] - 1)
     inverse = np.float32(1.0 / step)
@@ -164,25 +168,28 @@ def profiles(work, index, distance, out, table, limit, step, reach):
         # reading by index cannot be made a vector instruction; it stands alone therefore
         for lane in range(LANES):
             i = np.uint32(index[2, lane])
-            for order in range(5):
-                work[SCRATCH + order, lane] = table[i, order]
+            work[SCRATCH, lane] = table[i, 0]
+            work[SCRATCH + 1, lane] = table[i, 1]
+            work[SCRATCH + 2, lane] = table[i, 2]
+            work[SCRATCH + 3, lane] = table[i, 3]
         for lane in range(LANES):
             t = work[out + edge, lane]
             e1 = work[SCRATCH + 1, lane]
             e2 = work[SCRATCH + 2, lane]
             e3 = work[SCRATCH + 3, lane]
-            e4 = work[SCRATCH + 4, lane]
             work[out + edge, lane] = work[SCRATCH, lane] + t * (
                 e1 + t * (_HALF * e2 + t * _SIXTH * e3)
             )
-            work[out + edges + edge, lane] = e1 + t * (e2 + t * (_HALF * e3 + t * _SIXTH * e4))
-            work[out + 2 * edges + edge, lane] = e2 + t * (e3 + t * _HALF * e4)
-            work[out + 3 * edges + edge, lane] = e3 + t * e4
-            work[out + 4 * edges + edge, lane] = e4
+            work[out + edges + edge, lane] = e1 + t * (e2 + t * _HALF * e3)
+            work[out + 2 * edges + edge, lane] = e2 + t * e3
+            work[out + 3 * edges + edge, lane] = e3
+        if orders == 5:
+            for lane in range(LANES):
+                work[out + 4 * edges + edge, lane] = table[np.uint32(index[2, lane]), 4]
 
 
 @_compiled
-def one_corner(work, index, flat, width, origin):
+def one_corner(work, index, flat, width, origin, orders):
     """M and its derivatives where a pixel feels the four fields of one corner."""
     for lane in range(LANES):
         # the corner is the lower-left one of field (cx, cy)
@@ -214,8 +221,6 @@ def one_corner(work, index, flat, width, origin):
         work[M01, lane] = y1 * along_y
         work[M20, lane] = work[EX + 2, lane] * along_x
         work[M02, lane] = work[EY + 2, lane] * along_y
-        work[M40, lane] = work[EX + 4, lane] * along_x
-        work[M04, lane] = work[EY + 4, lane] * along_y
         work[DENSITY, lane] = x1 * work[SCRATCH + 3, lane] + y1 * work[SCRATCH + 4, lane]
     for lane in range(LANES):
         twist = work[SCRATCH, lane]
@@ -225,25 +230,29 @@ def one_corner(work, index, flat, width, origin):
         work[M31, lane] = twist * work[EX + 3, lane] * y1
         work[M13, lane] = twist * x1 * work[EY + 3, lane]
         work[M22, lane] = twist * work[EX + 2, lane] * work[EY + 2, lane]
+    if orders == 5:
+        for lane in range(LANES):
+            work[M40, lane] = work[EX + 4, lane] * work[SCRATCH + 1, lane]
+            work[M04, lane] = work[EY + 4, lane] * work[SCRATCH + 2, lane]
 
 
 @_compiled
-def many_corners(work, index, flat, width, origin, reach):
+def many_corners(work, index, flat, width, origin, reach, orders):
     """The same where a pixel feels several corners: sums over the fields within reach."""
     sides = 2 * reach
-    weights(work, EX, WX, reach)
-    weights(work, EY, WY, reach)
+    weights(work, EX, WX, reach, orders)
+    weights(work, EY, WY, reach, orders)
     for sy in range(sides):
         for sx in range(sides):
             for lane in range(LANES):
                 k = (index[1, lane] + sy - reach) * width + index[0, lane] - origin + sx - reach
                 work[TT + sy * sides + sx, lane] = flat[np.uint32(k)]
-    for order in range(5):
+    for order in range(orders):
         for sy in range(sides):
             multiply_add(
                 work, SUMS + order * sides + sy, TT + sy * sides, WX + order * sides, sides
             )
-    for k in range(len(ORDERS)):
+    for k in range(len(ORDERS) if orders == 5 else len(ORDERS) - 2):
         of_x, of_y = ORDERS[k]
         multiply_add(work, M00 + k, SUMS + of_x * sides, WY + of_y * sides, sides)
     edge_densities(work, reach)
@@ -260,11 +269,11 @@ def multiply_add(work, out, first, second, count):
 
 
 @_compiled
-def weights(work, profile, weight, reach):
+def weights(work, profile, weight, reach, orders):
     """Weights of the fields and their derivatives from the edges between them."""
     sides = 2 * reach
     edges = sides - 1
-    for order in range(5):
+    for order in range(orders):
         first = profile + order * edges
         to = weight + order * sides
         for lane in range(LANES):
@@ -301,17 +310,17 @@ def edge_densities(work, reach):
 @_compiled
 def pattern(work, index, scene, u, v, columns, rows):
     """Blurred mask and derivatives for the tile whose first pixel is at sensor point (u, v)."""
-    reach = scene.reach
+    reach, orders = scene.reach, scene.orders
     locate(work, index, scene.map, u, v, scene.pixel_um, columns, rows)
-    profiles(work, index, DX, EX, scene.table_x, scene.limit_x, scene.step_x, reach)
-    profiles(work, index, DY, EY, scene.table_y, scene.limit_y, scene.step_y, reach)
+    profiles(work, index, DX, EX, scene.table_x, scene.limit_x, scene.step_x, reach, orders)
+    profiles(work, index, DY, EY, scene.table_y, scene.limit_y, scene.step_y, reach, orders)
     flat = scene.fields.ravel()
     width = np.int32(scene.fields.shape[1])
     origin = np.int32(scene.j0 * scene.fields.shape[1] + scene.i0)
     if reach == 1:
-        one_corner(work, index, flat, width, origin)
+        one_corner(work, index, flat, width, origin, orders)
     else:
-        many_corners(work, index, flat, width, origin, reach)
+        many_corners(work, index, flat, width, origin, reach, orders)
 
 
 @_compiled
@@ -328,14 +337,14 @@ def signals(work, index, scene, row0, column0, rows, columns):
         for part_u in range(subpixels):
             u = u_first + ((part_u + 0.5) / subpixels - 0.5) * scene.pixel_um
             pattern(work, index, scene, u, v, columns, rows)
-            add_part(work, scene.shape, np.float32(1.0 / (subpixels * subpixels)))
+            add_part(work, scene.shape, np.float32(1.0 / (subpixels * subpixels)), scene.orders)
     for row in range(TILE):
         v = v_first + row * scene.pixel_um
         grey_levels(work, scene.photometry, scene.axes, scene.pixel_um, u_first, v, row * TILE)
 
 
 @_compiled
-def add_part(work, shape, share):
+def add_part(work, shape, share, orders):
     """Add one part of the pixel: the cumulant series and what the signals are made of."""
     c11, c31 = share * np.float32(shape[0]), share * np.float32(shape[1])
     c13, c22 = share * np.float32(shape[2]), share * np.float32(shape[3])
@@ -364,7 +373,9 @@ def add_part(work, shape, share):
         )
         work[4, lane] += b20 * q20 + b02 * q02 + b11 * q11
         work[5, lane] += share * (curvature - density)
-        work[6, lane] += k40 * work[M40, lane] + k22 * q22 + k04 * work[M04, lane]
+    if orders == 5:
+        for lane in range(LANES):
+            work[6, lane] += k40 * work[M40, lane] + k22 * work[M22, lane] + k04 * work[M04, lane]
 
 
 @_compiled
@@ -450,10 +461,11 @@ def gram(image, valid, tiles, noise, scene):
         k = 0
         for a in range(N_SIGNALS):
             for b in range(a, N_SIGNALS):
-                total = np.float32(0.0)
-                for lane in range(LANES):
-                    total += work[a, lane] * work[b, lane]
-                out[n, k] = total
+                if scene.orders == 5 or (a != 6 and b != 6):
+                    total = np.float32(0.0)
+                    for lane in range(LANES):
+                        total += work[a, lane] * work[b, lane]
+                    out[n, k] = total
                 k += 1
     return out
 

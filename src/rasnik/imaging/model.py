@@ -35,6 +35,8 @@ PATTERN_TOLERANCE = 7e-5
 #: Smallest blur that is modelled, in pixels; below it the edges are sharper than the pixel.
 MIN_BLUR_PX = 0.2
 
+_KURTOSIS = 6  # its row among the signals
+
 
 def _pixel_parts(jacobian: NDArray[np.float64], pixel: float, blur_um: float) -> int:
     """In how many parts per side a pixel is divided so that the cumulant series suffices.
@@ -55,9 +57,19 @@ def _pixel_parts(jacobian: NDArray[np.float64], pixel: float, blur_um: float) ->
 
 
 def make_scene(
-    mask: ChessField, projection: Projection, appearance: Appearance, camera: Camera
+    mask: ChessField,
+    projection: Projection,
+    appearance: Appearance,
+    camera: Camera,
+    *,
+    kurtosis_signal: bool = False,
 ) -> kernels.Scene:
     """Gather what the kernels need for one pose and appearance.
+
+    Parameters
+    ----------
+    kurtosis_signal : bool, optional
+        Whether the derivative by kurtosis is wanted; it is zero otherwise.
 
     Raises
     ------
@@ -109,6 +121,7 @@ def make_scene(
         i0,
         j0,
         reach,
+        5 if kurtosis_signal else 4,
     )
 
 
@@ -171,7 +184,8 @@ def expected_signals(
         variance (grey per um^2 on the sensor), by edge shift (grey per field), by the
         fourth cumulant of the blur (grey per um^4); and the grey level itself.
     """
-    scene = make_scene(mask, projection, appearance, camera)
+    wide = _KURTOSIS in signals
+    scene = make_scene(mask, projection, appearance, camera, kurtosis_signal=wide)
     planes: NDArray[np.float32] = kernels.render(*camera.shape, scene, np.array(signals))
     return planes
 
