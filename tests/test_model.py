@@ -198,6 +198,7 @@ def test_products_are_sums_over_pixels(rng) -> None:
     tiles = np.array([[0, 0], [2, 3], [4, 5]], dtype=np.int32)  # the last one is cut off
     scene = make_scene(MASK, projection, appearance, CAMERA, kurtosis_signal=True)
     products, counts = tile_products(image, valid, scene, (0.3, 0.01), tiles)
+    upper = np.triu_indices(8)
     for (row, column), product, count in zip(tiles, products, counts, strict=True):
         here = slice(16 * row, 16 * row + 16), slice(16 * column, 16 * column + 16)
         s = signals[(slice(None), *here)].copy()
@@ -206,7 +207,7 @@ def test_products_are_sums_over_pixels(rng) -> None:
         assert count == valid[here].sum()
         expected = np.einsum("aij,bij,ij->ab", s, s, weight)
         scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
-        assert np.abs((product - expected) / scale).max() < 1e-4
+        assert np.abs((product - expected[upper]) / scale[upper]).max() < 1e-4
 
 
 def test_profile_table_is_the_folded_gaussian() -> None:

@@ -119,6 +119,8 @@ def _scatter_growth(
 
 def explained(frame: Frame, noise: tuple[float, float], chi2_ndf: float) -> float:
     """Fraction of the variance over the used pixels, apart from their noise, that is modelled."""
+    if chi2_ndf <= 1.0:
+        return 1.0
     used = frame.image[::3, ::3][frame.valid[::3, ::3] > 0]
     variance = noise[0] + noise[1] * max(float(used.mean()), 0.0)
-    return 1.0 - max(chi2_ndf - 1.0, 0.0) * variance / max(float(used.var()), 1e-12)
+    return 1.0 - (chi2_ndf - 1.0) * variance / max(float(used.var()), 1e-12)

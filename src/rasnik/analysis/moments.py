@@ -35,7 +35,6 @@ __all__ = [
     "Moments",
     "all_tiles",
     "gather",
-    "tile_basis",
 ]
 
 MASK_X, MASK_Y, DARK, LIGHT, BLUR_VARIANCE, EDGE_SHIFT, KURTOSIS = range(7)
@@ -54,24 +53,33 @@ class Moments:
         Information on (signal, monomial) pairs.
     vector : ndarray, shape (42,)
         Their projections of the residual.
-    per_tile : ndarray, shape (n, 42)
-        The same for every tile.
     chi2 : float
         Sum of squared residuals over variance.
     chi2_per_tile, counts : ndarray, shape (n,)
         Chi-square and number of pixels of every tile.
+    projections : ndarray, shape (n, 7)
+        Projections of every tile's residual on the signals.
+    basis : ndarray, shape (n, 6)
+        Monomials at the centres of the tiles.
     """
 
     matrix: NDArray[np.float64]
     vector: NDArray[np.float64]
-    per_tile: NDArray[np.float64]
     chi2: float
     chi2_per_tile: NDArray[np.float64]
     counts: NDArray[np.float64]
+    projections: NDArray[np.float64]
+    basis: NDArray[np.float64]
 
     @property
     def n_pixels(self) -> int:
         return int(self.counts.sum())
+
+    @property
+    def per_tile(self) -> NDArray[np.float64]:
+        """`vector` of every tile, shape (n, 42)."""
+        products = self.projections[:, :, None] * self.basis[:, None, :]
+        return products.reshape(len(self.basis), -1)
 
 
 @lru_cache(maxsize=8)
@@ -82,15 +90,36 @@ def all_tiles(shape: tuple[int, int]) -> NDArray[np.int32]:
     return np.ascontiguousarray(tiles.reshape(-1, 2), dtype=np.int32)
 
 
-def tile_basis(camera: Camera, tiles: NDArray[np.int32]) -> NDArray[np.float64]:
-    """Monomials at the centres of tiles, shape (n, 6)."""
+@lru_cache(maxsize=8)
+def _monomials(
+    camera: Camera, tile_bytes: bytes
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Monomials at the centres of tiles, shape (n, 6), and their 21 products, shape (n, 21)."""
+    tiles = np.frombuffer(tile_bytes, dtype=np.int32).reshape(-1, 2)
     height, width = camera.shape
     ends = np.minimum(tiles * kernels.TILE + kernels.TILE, [height, width])
     centre = (tiles * kernels.TILE + ends - 1) / 2
     (u0, v0), (hu, hv) = camera.origin_um, camera.half_size_um
-    return surface(
-        (u0 + centre[:, 1] * camera.pixel_um) / hu, (v0 + centre[:, 0] * camera.pixel_um) / hv
-    ).T
+    u = (u0 + centre[:, 1] * camera.pixel_um) / hu
+    v = (v0 + centre[:, 0] * camera.pixel_um) / hv
+    basis = np.ascontiguousarray(surface(u, v).T)
+    first, second = np.triu_indices(N_MONOMIALS)
+    return basis, basis[:, first] * basis[:, second]
+
+
+def _symmetric_index(size: int) -> NDArray[np.intp]:
+    """Position of element (a, b) in the packed upper triangle, shape (size * size,)."""
+    index = np.zeros((size, size), dtype=np.intp)
+    upper = np.triu_indices(size)
+    index[upper] = index[upper[::-1]] = np.arange(len(upper[0]))
+    return index.ravel()
+
+
+_PRODUCT = _symmetric_index(kernels.N_SIGNALS).reshape(kernels.N_SIGNALS, kernels.N_SIGNALS)
+_SIGNAL_PAIRS = _PRODUCT[:_N, :_N][np.triu_indices(_N)]
+_RESIDUAL_PAIRS = _PRODUCT[:_N, kernels.RESIDUAL]
+_CHI2 = _PRODUCT[kernels.RESIDUAL, kernels.RESIDUAL]
+_EXPAND = np.ix_(_symmetric_index(_N), _symmetric_index(N_MONOMIALS))
 
 
 def gather(
@@ -117,23 +146,23 @@ def gather(
         Leave out tiles that fit much worse than the median tile (borders, dirt).
     """
     products, counts = tile_products(image, valid, scene, noise, tiles)
+    basis, basis_products = _monomials(camera, tiles.tobytes())
     if trim:
-        ratio = products[:, kernels.RESIDUAL, kernels.RESIDUAL] / np.maximum(counts, 1)
+        ratio = products[:, _CHI2] / np.maximum(counts, 1)
         keep = ratio <= _TRIM * np.median(ratio[counts > 0])
-        products, counts, tiles = products[keep], counts[keep], tiles[keep]
-    basis = tile_basis(camera, tiles)
-    pairs = np.einsum("tk,tl->tkl", basis, basis).reshape(len(tiles), -1)
-    signals = np.ascontiguousarray(products[:, :_N, :_N]).reshape(len(tiles), -1)
-    matrix = (signals.T @ pairs).reshape(_N, _N, N_MONOMIALS, N_MONOMIALS)
-    residual = products[:, :_N, kernels.RESIDUAL]
-    per_tile = np.einsum("ts,tk->tsk", residual, basis).reshape(len(tiles), -1)
-    chi2 = products[:, kernels.RESIDUAL, kernels.RESIDUAL]
+        products, counts = products[keep], counts[keep]
+        basis, basis_products = basis[keep], basis_products[keep]
+    packed = products[:, _SIGNAL_PAIRS].T @ basis_products
+    blocks = packed[_EXPAND].reshape(_N, _N, N_MONOMIALS, N_MONOMIALS)
     size = _N * N_MONOMIALS
+    projections = products[:, _RESIDUAL_PAIRS]
+    chi2 = products[:, _CHI2]
     return Moments(
-        matrix.transpose(0, 2, 1, 3).reshape(size, size),
-        per_tile.sum(axis=0),
-        per_tile,
+        blocks.transpose(0, 2, 1, 3).reshape(size, size),
+        (projections.T @ basis).ravel(),
         float(chi2.sum()),
         chi2,
         counts,
+        projections,
+        basis,
     )

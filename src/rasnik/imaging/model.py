@@ -211,15 +211,12 @@ def tile_products(
 
     Returns
     -------
-    products : ndarray, shape (n, 8, 8)
-        Signals in the order of `expected_signals`, the residual last.
+    products : ndarray, shape (n, 36)
+        Upper triangle, row by row, of the 8 x 8 products of the signals in the order of
+        `expected_signals`, the residual last.
     counts : ndarray, shape (n,)
         Pixels used.
     """
     floor = max(noise[0], 1e-3 * noise[1] * float(np.ptp(scene.photometry[:, 0])), 1e-12)
     packed = kernels.gram(image, valid, tiles, np.array([*noise, floor]), scene)
-    products = np.empty((len(tiles), kernels.N_SIGNALS, kernels.N_SIGNALS))
-    upper = np.triu_indices(kernels.N_SIGNALS)
-    products[:, upper[0], upper[1]] = packed[:, :-1]
-    products[:, upper[1], upper[0]] = packed[:, :-1]
-    return products, packed[:, -1]
+    return packed[:, :-1], packed[:, -1]
