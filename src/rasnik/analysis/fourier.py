@@ -36,7 +36,9 @@ _LEAST_FIELDS_PER_PIXEL = 1e-7
 # Peaks this close to zero frequency (in bins) are light, not pattern.
 _LEAST_BINS = 2.5
 _PEAKS = 12
-_PAIRS_TRIED = 10
+_PAIRS_TRIED = 6
+# Power of a primary in units of that of white noise, whose highest peaks reach 15.
+_LEAST_PRIMARY = 40.0
 # Primaries of a square pattern are equal and perpendicular; a slanted view changes both.
 _MOST_LENGTH_RATIO = 1.7
 _LEAST_SINE = math.sin(math.radians(55))
@@ -176,7 +178,7 @@ def find_lattice(
             best = trial
             if trial.agrees(_GOOD_AGREEMENT):
                 break
-    if best is not None and best.seen.fraction < _WHOLE_COVERAGE:
+    if best is not None and best.agrees(_LEAST_AGREEMENT) and best.seen.fraction < _WHOLE_COVERAGE:
         best = _within_region(image, valid, best, noise_variance)
     if best is None or not best.agrees(_LEAST_AGREEMENT):
         return Flag.BLANK if _is_blank(image, valid) else Flag.NO_MASK
@@ -244,7 +246,11 @@ def _trial(
     steps: int = 2,
 ) -> _Trial | None:
     """Refine a pair of wave vectors to a lattice and see whether the fields agree with it."""
-    start = primary_pair(refine(picture, pair, steps))
+    found = refine(picture, pair, steps)
+    power = np.abs(found.transform) ** 2
+    if power.min() < _LEAST_PRIMARY * noise_variance * picture.noise_moments[2, 2]:
+        return None
+    start = primary_pair(found)
     if not abs(np.linalg.det(start[:, :2])) > _LEAST_FIELDS_PER_PIXEL:
         return None
     tones = chess_lattice(picture, start, noise_variance)
