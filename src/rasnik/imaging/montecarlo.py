@@ -17,42 +17,37 @@ within the pixel, blur spread over 11 x 11 pixels) this one replaces by its exac
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from rasnik.imaging.deviations import CoherentLight, Deviations, EdgeErrors
 from rasnik.imaging.levels import LevelMap, level_at
-from rasnik.imaging.nufft import (
-    GUARD,
-    OVERSAMPLING,
-    evaluate_series,
-    grid_lengths,
-    kernel_transform,
-)
 from rasnik.imaging.projection import Projection, sensor_grid_um
-from rasnik.imaging.transfer import GaussianTransfer, OpticalTransfer
+from rasnik.imaging.series import Scene, Tile
+from rasnik.imaging.transfer import (
+    GaussianTransfer,
+    OpticalTransfer,
+    PupilTransfer,
+    ScaledTransfer,
+)
 from rasnik.instrument import System
 from rasnik.mask import ChessField
 
-__all__ = ["ACCURACY", "exact_image", "exact_pattern"]
+__all__ = ["ACCURACY", "exact_image", "exact_pattern", "grey_levels"]
 
 #: Largest error of the pattern, in units of the step from black to white (affine maps).
 ACCURACY = 1e-7
 
-# Fine grid points of one tile: at most, which bounds the memory to some 100 MB; and as many
-# as the processor's cache holds, above which a point takes about 1.3 times as long.
-_TILE_POINTS = 2**22
-_CACHED_POINTS = 2**20
-# Change of the local magnification from the middle to the corner of a tile of a projective
-# map; the blur of a tile is that of its middle.
-_TILE_CHANGE = 4e-4
 # Transferred detail up to which the work stays bearable: a blur of 1/20 pixel.
 _MAX_CYCLES_PER_PIXEL = 16.8
-_SPLITS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
+# A blur that varies over the image is interpolated between images of these many blurs, which
+# for a change by half is right to 1e-6 of the step.
+_BLUR_NODES = 7
+# Points along the side of a pixel at which the intensity of coherent light is taken.
+_COHERENT_POINTS = 5
 
 
 def exact_image(
@@ -63,6 +58,7 @@ def exact_image(
     dark_map: LevelMap | float | None = None,
     shape: tuple[int, int] | None = None,
     transfer: OpticalTransfer | None = None,
+    deviations: Deviations | None = None,
     workers: int = 1,
 ) -> NDArray[np.float64]:
     """Expected grey level of every pixel: ``dark + (light - dark) * pattern``.
@@ -80,6 +76,8 @@ def exact_image(
         (height, width); by default that of the system's read-out image.
     transfer : OpticalTransfer, optional
         Blur of the optics; by default Gaussian with the system's ``optics.blur_um``.
+    deviations : Deviations, optional
+        How the instrument deviates from the ideal one.
     workers : int
         Threads.
 
@@ -95,17 +93,113 @@ def exact_image(
         `exact_pattern`.
     """
     shape = system.shape if shape is None else shape
-    if transfer is None:
-        transfer = GaussianTransfer(system.optics.blur_um)
-    pattern = exact_pattern(
-        system.mask, projection, shape, system.pitch_um, transfer, workers=workers
-    )
-    u, v = sensor_grid_um(shape, system.pitch_um)
+    change = deviations or Deviations()
+    transfer = transfer or change.transfer or GaussianTransfer(system.optics.blur_um)
+
+    def pattern_of(transfer: OpticalTransfer) -> NDArray[np.float64]:
+        return exact_pattern(
+            system.mask,
+            projection,
+            shape,
+            system.pitch_um,
+            transfer,
+            gap_um=change.gap_um,
+            points_um=change.points_um,
+            edges=change.edges,
+            workers=workers,
+        )
+
+    if change.blur_ratio is not None:
+        pattern = _with_varying_blur(pattern_of, transfer, change.blur_ratio)
+    else:
+        pattern = pattern_of(transfer)
+    if change.coherent is not None:
+        share = change.coherent.share
+        pattern *= 1 - share
+        pattern += share * _coherent_pattern(system, projection, shape, change, change.coherent)
+    return grey_levels(pattern, system, light_map, dark_map, change)
+
+
+def grey_levels(
+    pattern: NDArray[np.float64],
+    system: System,
+    light_map: LevelMap | float | None,
+    dark_map: LevelMap | float | None,
+    deviations: Deviations,
+) -> NDArray[np.float64]:
+    """Grey levels of a pattern (changed in place); arguments as for `exact_image`."""
+    u, v = sensor_grid_um(pattern.shape, system.pitch_um)
     dark = level_at("dark_map", dark_map, system.sensor.dark_level, u, v[:, None])
     light = level_at("light_map", light_map, system.sensor.light_level, u, v[:, None])
     pattern *= light - dark
     pattern += dark
+    if deviations.illumination is not None:
+        pattern *= deviations.illumination
     return pattern
+
+
+def _with_varying_blur(
+    pattern_of: Callable[[OpticalTransfer], NDArray[np.float64]],
+    transfer: OpticalTransfer,
+    ratio: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Every pixel with its own blur: images with Chebyshev nodes of the squared ratio.
+
+    An image is an analytic function of the variance of its Gaussian blur.
+    """
+    square = ratio**2
+    low, high = float(square.min()), float(square.max())
+    if not low > 0:
+        raise ValueError("the blur must stay positive everywhere on the sensor")
+    if high - low < 1e-12 * high:
+        return pattern_of(ScaledTransfer(transfer, high**0.5))
+    node = np.cos(np.pi * (np.arange(_BLUR_NODES) + 0.5) / _BLUR_NODES)
+    at = (2 * square - low - high) / (high - low)
+    total = np.zeros_like(at)
+    for k, own in enumerate(node):
+        others = np.delete(node, k)
+        weight = np.prod([(at - other) / (own - other) for other in others], axis=0)
+        width = np.sqrt((low + high + own * (high - low)) / 2)
+        total += weight * pattern_of(ScaledTransfer(transfer, float(width)))
+    return total
+
+
+def _coherent_pattern(
+    system: System,
+    projection: Projection,
+    shape: tuple[int, int],
+    change: Deviations,
+    light: CoherentLight,
+) -> NDArray[np.float64]:
+    """Intensity where the light is coherent: the amplitude squared, averaged over the pixel.
+
+    The amplitude at a point is exact; its square has no finite series on the mask, so that the
+    mean over the pixel is taken by Gauss-Legendre quadrature.
+    """
+    pitch_um = system.pitch_um
+    u, v = sensor_grid_um(shape, pitch_um)
+    points = change.points_um or tuple(np.meshgrid(u, v))
+    node, weight = np.polynomial.legendre.leggauss(_COHERENT_POINTS)
+    offset = node * (pitch_um - change.gap_um) / 2
+    parts = (False, True) if light.defocus_um else (False,)
+    total = np.zeros(shape)
+    for du, weight_u in zip(offset, weight / 2, strict=True):
+        for dv, weight_v in zip(offset, weight / 2, strict=True):
+            for imaginary in parts:
+                amplitude = exact_pattern(
+                    system.mask,
+                    projection,
+                    shape,
+                    pitch_um,
+                    PupilTransfer(
+                        light.wavelength_um, light.numerical_aperture, light.defocus_um, imaginary
+                    ),
+                    gap_um=pitch_um,
+                    points_um=(points[0] + du, points[1] + dv),
+                    edges=change.edges,
+                )
+                total += weight_u * weight_v * amplitude**2
+    return total
 
 
 def exact_pattern(
@@ -115,6 +209,9 @@ def exact_pattern(
     pitch_um: float,
     transfer: OpticalTransfer,
     *,
+    gap_um: float = 0.0,
+    points_um: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+    edges: EdgeErrors | None = None,
     workers: int = 1,
 ) -> NDArray[np.float64]:
     """Share of the light of a wide white area that every pixel receives.
@@ -132,9 +229,18 @@ def exact_pattern(
     shape : tuple of int
         (height, width) in pixels.
     pitch_um : float
-        Side of the square pixels, which leave no gap.
+        Distance of neighbouring pixels.
     transfer : OpticalTransfer
         Blur of the optics.
+    gap_um : float
+        Dead area between the light-sensitive squares of neighbouring pixels; at the full
+        pitch a pixel is a point.
+    points_um : tuple of ndarray, optional
+        (u, v) of shape `shape`: sensor points to take the pixels at, in place of their
+        grid (distorted images, misplaced pixels). Each is mapped exactly; blur and pixel
+        keep their outline.
+    edges : EdgeErrors, optional
+        Errors of the printed contours; to second order in their size over the blur.
     workers : int
         Threads.
 
@@ -146,8 +252,9 @@ def exact_pattern(
     Raises
     ------
     ValueError
-        If the shape is not positive, the blur is below 1/20 of a pixel, or the map is
-        singular or sends points of the sensor to infinity.
+        If the shape is not positive, the blur is below 1/20 of a pixel, the gap is not
+        between nothing and a pixel, or the map is singular or sends points of the sensor to
+        infinity.
     """
     if min(shape) < 1:
         raise ValueError(f"the image must have pixels, its shape cannot be {shape}")
@@ -156,15 +263,15 @@ def exact_pattern(
             f"the blur is too small against the {pitch_um:g} um pixel for the exact image, which "
             "needs a Gaussian sigma of 1/20 pixel at least: raise optics.blur_um"
         )
-    scene = _Scene(mask, projection, shape, pitch_um, transfer)
+    if not 0 <= gap_um <= pitch_um:
+        raise ValueError(f"the dead area of {gap_um:g} um does not fit a {pitch_um:g} um pixel")
+    scene = Scene(mask, projection, shape, pitch_um, transfer, pitch_um - gap_um, points_um, edges)
     scene.check()
     image = np.empty(shape)
     tiles = scene.tiles()
 
-    def fill(tile: _Tile) -> None:
-        image[tile.row : tile.row + tile.height, tile.column : tile.column + tile.width] = (
-            scene.render(tile)
-        )
+    def fill(tile: Tile) -> None:
+        image[tile.rows, tile.columns] = scene.render(tile)
 
     if workers > 1 and len(tiles) > 1:
         with ThreadPoolExecutor(workers) as pool:
@@ -173,197 +280,3 @@ def exact_pattern(
         for tile in tiles:
             fill(tile)
     return image
-
-
-@dataclass(frozen=True)
-class _Tile:
-    row: int
-    column: int
-    height: int
-    width: int
-
-
-@dataclass(frozen=True)
-class _Span:
-    """What a tile sees along one axis of the mask, taken as one period."""
-
-    low_um: float
-    length_um: float
-    highest: int  # harmonic
-
-    def fields(self, field_um: float) -> tuple[int, int]:
-        """First field in the span, and the one after the last."""
-        high_um = self.low_um + self.length_um
-        return math.floor(self.low_um / field_um), math.ceil(high_um / field_um)
-
-    def field_series(self, field_um: float, k: NDArray[np.int64]) -> NDArray[np.complex128]:
-        """Harmonics k of each field (the part of it in the span), shape (k.size, fields)."""
-        first, end = self.fields(field_um)
-        edges = (np.arange(first, end + 1) * field_um - self.low_um) / self.length_um
-        edges = np.clip(edges, 0, 1)
-        width, middle = np.diff(edges), (edges[:-1] + edges[1:]) / 2
-        k = k[:, None]
-        return np.asarray(width * np.sinc(k * width) * np.exp(-2j * np.pi * k * middle))
-
-
-@dataclass(frozen=True)
-class _Window:
-    x: _Span
-    y: _Span
-    jacobian: NDArray[np.float64]
-
-    @property
-    def lengths(self) -> tuple[int, int]:
-        """Fine grid (rows, columns)."""
-        return grid_lengths((self.y.highest, self.x.highest))
-
-
-@dataclass(frozen=True)
-class _Scene:
-    mask: ChessField
-    projection: Projection
-    shape: tuple[int, int]
-    pitch_um: float
-    transfer: OpticalTransfer
-
-    def check(self) -> None:
-        matrix = self.projection.matrix
-        u, v = (side * self.pitch_um / 2 for side in self.shape[::-1])
-        if 1 - abs(matrix[2, 0]) * u - abs(matrix[2, 1]) * v <= 0:
-            raise ValueError("the projection sends points of the sensor to infinity")
-        if np.linalg.cond(self.projection.jacobian) > 1e6:
-            raise ValueError("the projection is singular: it maps the sensor onto a line")
-
-    def pixel_to_sensor(self) -> NDArray[np.float64]:
-        """Matrix from (column, row, 1) to (u, v, 1)."""
-        u, v = sensor_grid_um(self.shape, self.pitch_um)
-        return np.array([[self.pitch_um, 0, u[0]], [0, self.pitch_um, v[0]], [0, 0, 1.0]])
-
-    def tiles(self) -> list[_Tile]:
-        """The cheapest cut of the image: small ones overlap more, large ones hold more
-        fields that a rotated view does not see."""
-        best: tuple[float, list[_Tile]] | None = None
-        for split in _SPLITS:
-            tiles = self._cut(split)
-            middle = tiles[len(tiles) // 2]
-            points = float(np.prod(self._window(middle).lengths))
-            cost = len(tiles) * points * (1.0 if points <= _CACHED_POINTS else 1.3)
-            if points > _TILE_POINTS or self._change(middle) > _TILE_CHANGE:
-                continue
-            if best is not None and cost > 1.5 * best[0]:
-                break
-            if best is None or cost < best[0]:
-                best = cost, tiles
-        if best is None:
-            raise ValueError(
-                "the image is too large, or the projection too strong, to compute it exactly"
-            )
-        return best[1]
-
-    def _cut(self, split: int) -> list[_Tile]:
-        rows, columns = (
-            np.unique(np.linspace(0, side, split + 1).astype(int)) for side in self.shape
-        )
-        return [
-            _Tile(r0, c0, r1 - r0, c1 - c0)
-            for r0, r1 in zip(rows[:-1], rows[1:], strict=True)
-            for c0, c1 in zip(columns[:-1], columns[1:], strict=True)
-        ]
-
-    def _change(self, tile: _Tile) -> float:
-        """Relative change of the magnification from the middle of a tile to its corner."""
-        radius = np.hypot(tile.width, tile.height) * self.pitch_um / 2
-        return float(2 * np.hypot(*self.projection.matrix[2, :2]) * radius)
-
-    def _window(self, tile: _Tile) -> _Window:
-        u, v = sensor_grid_um(self.shape, self.pitch_um)
-        u = u[[tile.column, tile.column + tile.width - 1]]
-        v = v[[tile.row, tile.row + tile.height - 1]]
-        jacobian = _local_jacobian(self.projection, float(u.mean()), float(v.mean()))
-        corners = self.projection.to_mask(u, v[:, None])
-        reach = self.transfer.reach_um + self.pitch_um / np.sqrt(2)
-        inverse = np.linalg.inv(jacobian)
-        spans = []
-        for axis in (0, 1):
-            cutoff = self.transfer.cutoff_per_um * np.hypot(*inverse[:, axis])
-            margin = max(
-                reach * np.hypot(*jacobian[axis]) * (1 + _TILE_CHANGE),
-                GUARD / (2 * OVERSAMPLING * cutoff),
-            )
-            low, high = corners[axis].min() - margin, corners[axis].max() + margin
-            spans.append(_Span(low, high - low, math.ceil(cutoff * (high - low))))
-        return _Window(spans[0], spans[1], jacobian)
-
-    def render(self, tile: _Tile) -> NDArray[np.float64]:
-        window = self._window(tile)
-        (rows, columns), x, y = window.lengths, window.x, window.y
-        # From pixels of this tile to fine grid steps of its window. The origin of the window
-        # is taken off first: on a large mask it is where the digits would be lost.
-        shift = np.array([[1, 0, -x.low_um], [0, 1, -y.low_um], [0, 0, 1]])
-        steps = np.diag([columns / x.length_um, rows / y.length_um, 1])
-        to_tile = np.array([[1, 0, tile.column], [0, 1, tile.row], [0, 0, 1.0]])
-        matrix = steps @ (shift @ self.projection.matrix) @ self.pixel_to_sensor() @ to_tile
-        return evaluate_series(
-            self._coefficients(window), (rows, columns), matrix, (tile.height, tile.width)
-        )
-
-    def _coefficients(self, window: _Window) -> NDArray[np.complex128]:
-        x, y, field_um = window.x, window.y, self.mask.field_um
-        rows, columns = window.lengths
-        k = np.arange(x.highest + 1)
-        m = np.r_[0 : y.highest + 1, -y.highest : 0]
-        along_x = x.field_series(field_um, k) / kernel_transform(k / columns)[:, None]
-        along_y = y.field_series(field_um, m) / kernel_transform(m / rows)[:, None]
-        fields = self.mask.fields(*x.fields(field_um), *y.fields(field_um))
-        # Summed by a loop of our own: a threaded BLAS spends more time on waking its threads
-        # than on matrices as narrow as these.
-        lines = np.einsum("ji,ki->jk", fields, along_x)
-        # Frequency on the sensor, in cycles per pixel, as sums of a column's and a row's part.
-        (a, b), (c, d) = window.jacobian * self.pitch_um
-        u_x, v_x = a * k / x.length_um, b * k / x.length_um
-        u_y, v_y = c * m / y.length_um, d * m / y.length_um
-        pixel = _sinc_of_sum(u_x, u_y)
-        pixel *= _sinc_of_sum(v_x, v_y)
-        p = self.pitch_um
-        response = pixel * self.transfer(u_x / p + u_y[:, None] / p, v_x / p + v_y[:, None] / p)
-        coefficients = np.empty(response.shape, np.complex128)
-        _sum_lines(along_y, lines, response, coefficients)
-        return coefficients
-
-
-@njit(cache=True, fastmath=True, nogil=True)
-def _sum_lines(weight, lines, factor, out):  # type: ignore[no-untyped-def]
-    """``out[m, k] = factor[m, k] * sum_j weight[m, j] * lines[j, k]``."""
-    # Real and imaginary parts apart, so that the inner loop becomes vector instructions.
-    lines_re, lines_im = lines.real.copy(), lines.imag.copy()
-    re, im = np.empty(out.shape[1]), np.empty(out.shape[1])
-    for m in range(out.shape[0]):
-        re[:] = 0.0
-        im[:] = 0.0
-        for j in range(lines.shape[0]):
-            a, b = weight[m, j].real, weight[m, j].imag
-            for k in range(re.size):
-                re[k] += a * lines_re[j, k] - b * lines_im[j, k]
-                im[k] += a * lines_im[j, k] + b * lines_re[j, k]
-        for k in range(re.size):
-            out[m, k] = factor[m, k] * complex(re[k], im[k])
-
-
-def _sinc_of_sum(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """sinc(x + y), shape (y.size, x.size), with sines of the one-dimensional parts only."""
-    x, y = np.pi * x, np.pi * y[:, None]
-    total = x + y
-    sine = np.sin(x) * np.cos(y)
-    sine += np.cos(x) * np.sin(y)
-    zero = np.abs(total) < 1e-7  # where sinc is 1 to rounding error
-    sine[zero] = total[zero] = 1.0
-    sine /= total
-    return sine
-
-
-def _local_jacobian(projection: Projection, u: float, v: float) -> NDArray[np.float64]:
-    """d(X, Y) / d(u, v) at a point of the sensor."""
-    m = projection.matrix
-    w = m[2, 0] * u + m[2, 1] * v + 1
-    x, y = projection.to_mask(u, v)
-    return (m[:2, :2] - np.outer([float(x), float(y)], m[2, :2])) / w

@@ -17,7 +17,15 @@ import scipy.special
 from numba import njit
 from numpy.typing import NDArray
 
-__all__ = ["GUARD", "OVERSAMPLING", "WIDTH", "evaluate_series", "grid_lengths", "kernel_transform"]
+__all__ = [
+    "GUARD",
+    "OVERSAMPLING",
+    "WIDTH",
+    "evaluate_series",
+    "evaluate_series_at",
+    "grid_lengths",
+    "kernel_transform",
+]
 
 #: Grid points per axis that contribute to a value.
 WIDTH = 10
@@ -30,6 +38,7 @@ GUARD = WIDTH // 2 + 1
 # the highest harmonic begins.
 _BETA = np.pi * np.sqrt((WIDTH * (1 - 0.5 / OVERSAMPLING)) ** 2 - 0.8)
 _DEGREE = 13
+_OUTSIDE = "pixels lie outside the window on which the series was summed"
 
 
 def grid_lengths(highest: tuple[int, int]) -> tuple[int, int]:
@@ -76,6 +85,30 @@ def _weights(s, table, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, fastmath=True, nogil=True)
+def _value(grid, x, y, table, weight_x, weight_y):  # type: ignore[no-untyped-def]
+    """Whether grid point (x, y) lies inside the guard, and the value there."""
+    x -= WIDTH / 2
+    y -= WIDTH / 2
+    first_x, first_y = int(np.ceil(x)), int(np.ceil(y))
+    if (
+        first_x < 0
+        or first_y < 0
+        or first_x + WIDTH > grid.shape[1]
+        or first_y + WIDTH > grid.shape[0]
+    ):
+        return False, 0.0
+    _weights(2 * (first_x - x) - 1, table, weight_x)
+    _weights(2 * (first_y - y) - 1, table, weight_y)
+    total = 0.0
+    for a in range(WIDTH):
+        line = 0.0
+        for b in range(WIDTH):
+            line += weight_x[b] * grid[first_y + a, first_x + b]
+        total += weight_y[a] * line
+    return True, total
+
+
+@njit(cache=True, fastmath=True, nogil=True)
 def _interpolate(grid, matrix, table, out):  # type: ignore[no-untyped-def]
     """Values at the pixels of `out`; `matrix` maps (column, row, 1) to grid (x, y, 1).
 
@@ -86,25 +119,25 @@ def _interpolate(grid, matrix, table, out):  # type: ignore[no-untyped-def]
     for row in range(height):
         for column in range(width):
             w = matrix[2, 0] * column + matrix[2, 1] * row + matrix[2, 2]
-            x = (matrix[0, 0] * column + matrix[0, 1] * row + matrix[0, 2]) / w - WIDTH / 2
-            y = (matrix[1, 0] * column + matrix[1, 1] * row + matrix[1, 2]) / w - WIDTH / 2
-            first_x, first_y = int(np.ceil(x)), int(np.ceil(y))
-            if (
-                first_x < 0
-                or first_y < 0
-                or first_x + WIDTH > grid.shape[1]
-                or first_y + WIDTH > grid.shape[0]
-            ):
+            x = (matrix[0, 0] * column + matrix[0, 1] * row + matrix[0, 2]) / w
+            y = (matrix[1, 0] * column + matrix[1, 1] * row + matrix[1, 2]) / w
+            inside, out[row, column] = _value(grid, x, y, table, weight_x, weight_y)
+            if not inside:
                 return False
-            _weights(2 * (first_x - x) - 1, table, weight_x)
-            _weights(2 * (first_y - y) - 1, table, weight_y)
-            total = 0.0
-            for a in range(WIDTH):
-                line = 0.0
-                for b in range(WIDTH):
-                    line += weight_x[b] * grid[first_y + a, first_x + b]
-                total += weight_y[a] * line
-            out[row, column] = total
+    return True
+
+
+@njit(cache=True, fastmath=True, nogil=True)
+def _interpolate_at(grid, x, y, table, out):  # type: ignore[no-untyped-def]
+    """Values at grid points (x, y), one for each element of `out`; returns as above."""
+    weight_x, weight_y = np.empty(WIDTH), np.empty(WIDTH)
+    for row in range(out.shape[0]):
+        for column in range(out.shape[1]):
+            inside, out[row, column] = _value(
+                grid, x[row, column], y[row, column], table, weight_x, weight_y
+            )
+            if not inside:
+                return False
     return True
 
 
@@ -138,6 +171,47 @@ def evaluate_series(
     ValueError
         If a pixel lies within `GUARD` grid steps of the ends of the period.
     """
+    image = np.empty(shape)
+    grid = _grid(coefficients, lengths)
+    if not _interpolate(grid, np.ascontiguousarray(matrix), _tap_polynomials(), image):
+        raise ValueError(_OUTSIDE)
+    return image
+
+
+def evaluate_series_at(
+    coefficients: NDArray[np.complex128],
+    lengths: tuple[int, int],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Sum the same series at any points.
+
+    Parameters
+    ----------
+    coefficients, lengths
+        As for `evaluate_series`.
+    x, y : ndarray of float64, shape (height, width)
+        Points in fine grid steps.
+
+    Returns
+    -------
+    ndarray of float64, shape (height, width)
+
+    Raises
+    ------
+    ValueError
+        If a point lies within `GUARD` grid steps of the ends of the period.
+    """
+    image = np.empty(x.shape)
+    grid = _grid(coefficients, lengths)
+    x, y = np.ascontiguousarray(x), np.ascontiguousarray(y)
+    if not _interpolate_at(grid, x, y, _tap_polynomials(), image):
+        raise ValueError(_OUTSIDE)
+    return image
+
+
+def _grid(coefficients: NDArray[np.complex128], lengths: tuple[int, int]) -> NDArray[np.float64]:
+    """The series on the fine grid."""
     rows, columns = lengths
     highest = coefficients.shape[0] // 2
     # The transform along y is made only for the columns that hold harmonics.
@@ -145,8 +219,4 @@ def evaluate_series(
     spectrum[: highest + 1] = coefficients[: highest + 1]
     spectrum[rows - highest :] = coefficients[highest + 1 :]
     spectrum = scipy.fft.ifft(spectrum, axis=0, norm="forward", overwrite_x=True)
-    grid = scipy.fft.irfft(spectrum, n=columns, axis=1, norm="forward")
-    image = np.empty(shape)
-    if not _interpolate(grid, np.ascontiguousarray(matrix), _tap_polynomials(), image):
-        raise ValueError("pixels lie outside the window on which the series was summed")
-    return image
+    return np.asarray(scipy.fft.irfft(spectrum, n=columns, axis=1, norm="forward"))
