@@ -64,10 +64,13 @@ def coverage(samples: FieldSamples) -> Coverage:
     around = grey[:-2, 1:-1] + grey[2:, 1:-1] + grey[1:-1, :-2] + grey[1:-1, 2:]
     contrast[1:-1, 1:-1] = (grey[1:-1, 1:-1] - around / 4) * samples.chess[1:-1, 1:-1]
     contrast = np.where(whole, contrast, 0.0)
-    typical = max(float(np.percentile(np.abs(contrast[whole]), 75)), 1e-12)
-    sums = _box_sum(np.clip(contrast / typical, -1, 1), _NEIGHBOURHOOD)
     counts = _box_sum(whole.astype(float), _NEIGHBOURHOOD)
-    fields = there & (sums > _LEAST_MEAN * counts) & (counts > 0)
+    fields = whole
+    for _ in range(2):  # what contrast is typical, the covered part itself must say
+        size = np.abs(contrast[fields & whole])
+        typical = max(float(np.percentile(size, 75)), 1e-12) if size.size else np.inf
+        sums = _box_sum(np.clip(contrast / typical, -1, 1), _NEIGHBOURHOOD)
+        fields = there & (sums > _LEAST_MEAN * counts) & (counts > 0)
     fields &= _away_from_blank(grey, there, _LEAST_RANGE * typical)
     judged = fields & whole
     count = int(judged.sum())

@@ -47,6 +47,7 @@ _LEAST_SINE = math.sin(math.radians(55))
 _GOOD_AGREEMENT = 0.80
 _LEAST_AGREEMENT = 0.75
 _CHANCE = 0.7
+_LEAST_JUDGED = 40
 # ... if it covers this much of the view.
 _LEAST_COVERAGE = 0.12
 # Below this coverage the transform is repeated over the part that shows the mask.
@@ -131,7 +132,8 @@ class _Trial:
         """Whether the fields show the chessboard that the lattice says."""
         chance = _CHANCE / math.sqrt(max(self.seen.judged, 1))
         return (
-            self.seen.agreement > max(least, _LEAST_AGREEMENT + chance)
+            self.seen.judged >= _LEAST_JUDGED
+            and self.seen.agreement > max(least, _LEAST_AGREEMENT + chance)
             and self.seen.fraction > _LEAST_COVERAGE
         )
 
