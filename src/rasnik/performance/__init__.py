@@ -1,0 +1,1 @@
+"""How well an instrument can do before it is built: bound, budget, design."""
