@@ -20,6 +20,7 @@ ROOMS = (
     "_config",
     "mask",
     "instrument",
+    "mask_files",
     "imaging",
     "analysis",
     "performance",
@@ -32,7 +33,7 @@ ROOMS = (
 EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 # Imports that take long or need an optional package; each is loaded where it is used.
-HEAVY = {"matplotlib", "h5py", "pyarrow", "numba", "PIL", "tifffile", "scipy"}
+HEAVY = {"matplotlib", "h5py", "pyarrow", "numba", "PIL", "tifffile", "scipy", "gdstk", "ezdxf"}
 
 
 def module_name(path: Path) -> str:
