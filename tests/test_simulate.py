@@ -286,7 +286,7 @@ def test_things_that_are_no_poses(system, poses, sentence):
         ({"n": 2.5}, TypeError, "must be a whole number, not 2.5"),
         ({"seed": -1}, ValueError, "seed must not be negative"),
         ({"seed": "a"}, TypeError, "seed must be a whole number"),
-        ({"path": "magic"}, ValueError, "path must be one of exact, not 'magic'"),
+        ({"path": "magic"}, ValueError, "path must be one of exact, paper, not 'magic'"),
         ({"statistics": "flat"}, ValueError, "statistics must be 'gaussian' or 'poisson'"),
     ],
 )

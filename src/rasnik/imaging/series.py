@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -71,7 +72,7 @@ class _Span:
         return math.floor(self.low_um / field_um), math.ceil(high_um / field_um)
 
     def box_series(
-        self, edges_um: NDArray[np.float64], k: NDArray[np.int64]
+        self, edges_um: NDArray[np.floating[Any]], k: NDArray[np.int64]
     ) -> NDArray[np.complex128]:
         """Harmonics k of each box from one edge to the next (the part of it in the span).
 
@@ -83,7 +84,7 @@ class _Span:
         return np.asarray(width * np.sinc(k * width) * np.exp(-2j * np.pi * k * middle))
 
     def line_series(
-        self, at_um: NDArray[np.float64], k: NDArray[np.int64]
+        self, at_um: NDArray[np.floating[Any]], k: NDArray[np.int64]
     ) -> NDArray[np.complex128]:
         """Harmonics k of an infinitely narrow line of 1 um at each place; (k.size, places)."""
         phase = -2j * np.pi * (at_um - self.low_um) / self.length_um

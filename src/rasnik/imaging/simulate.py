@@ -1,77 +1,53 @@
 """Simulated frames together with the truth they were made from.
 
 A frame is made in three steps: the pose of each frame is laid down (`Truth`), the expected
-image of that pose is computed (a *path*, see `PATHS`), and the sensor adds its noise. Frames
-of the same pose share the expected image. Every frame has a random generator of its own, so
-frame k of a simulation is the same whether it is made alone, in order, or by several threads.
+image of that pose is computed (a *path*, see `PATHS`, with the *effects* asked for), and the
+sensor adds its noise. Frames of the same pose share the expected image. Every frame has a
+random generator of its own, so frame k of a simulation is the same whether it is made alone, in
+order, or by several threads.
 """
 
 from __future__ import annotations
 
-import difflib
 import math
 import operator
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import groupby
-from numbers import Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rasnik.imaging.effects import Chain, Context, make_effects
 from rasnik.imaging.levels import LevelMap
 from rasnik.imaging.montecarlo import exact_image
-from rasnik.imaging.noise import ReadOut, Statistics, frame_dtype, quantise_levels
-from rasnik.imaging.projection import Projection
+from rasnik.imaging.motion import displacements, make_motions
+from rasnik.imaging.noise import ReadOut, Statistics
+from rasnik.imaging.paper import paper_image
+from rasnik.imaging.poses import Truth, check_on_mask, parse_pose, parse_poses
 from rasnik.instrument import System, load_system
 
 __all__ = ["PATHS", "Simulation", "Truth", "simulate"]
 
 #: Ways to compute the expected image, by name:
-#: (system, projection, light_map=..., dark_map=...) -> float64 (H, W).
-PATHS: dict[str, Callable[..., NDArray[np.float64]]] = {"exact": exact_image}
+#: (system, projection, light_map=..., dark_map=..., deviations=...) -> float64 (H, W).
+PATHS: dict[str, Callable[..., NDArray[np.float64]]] = {
+    "exact": exact_image,
+    "paper": paper_image,
+}
 
-# A mask seen through one lens is turned by 180 degrees.
-_USUAL_ORIENTATION = 4
-_POSE_NAMES = ("x_um", "y_um", "theta_rad", "scale", "orientation")
-# Keys of the random streams drawn from one seed.
-_POSITIONS, _FRAMES = 0, 1
-
-
-@dataclass(frozen=True, eq=False)
-class Truth:
-    """The pose a frame was made with; conventions as for an analysed pose.
-
-    For a pose given as an affine or projective `Projection`, scale, rotation and orientation
-    are those of the nearest similarity.
-    """
-
-    x_um: float
-    y_um: float
-    scale: float
-    theta_rad: float
-    orientation: int
-    projection: Projection = field(repr=False)
-
-    def as_dict(self) -> dict[str, float | int]:
-        """The five numbers of the pose by name."""
-        return {
-            "x_um": self.x_um,
-            "y_um": self.y_um,
-            "scale": self.scale,
-            "theta_rad": self.theta_rad,
-            "orientation": self.orientation,
-        }
+# Keys of the random streams drawn from one seed; 2 is that of the effects.
+_POSITIONS, _FRAMES, _MOTION = 0, 1, 3
 
 
 @dataclass(frozen=True)
 class _Settings:
     noise: bool
-    quantise: bool
     statistics: Statistics
     path: str
     light_map: LevelMap | float | None
@@ -88,8 +64,10 @@ class Simulation:
     Attributes
     ----------
     system : System
+        As given. What effects change of it is not in it.
     truth : tuple of Truth
-        One per frame.
+        One per frame: where the mask stands, which is not what the image shows if an effect
+        bends the light or stretches the mask.
     seed : int
         Makes the same simulation again.
     """
@@ -98,72 +76,104 @@ class Simulation:
     truth: tuple[Truth, ...]
     seed: int
     settings: _Settings = field(repr=False)
+    chain: Chain = field(repr=False)
 
     @cached_property
     def frames(self) -> NDArray[Any]:
         """All frames, shape (n, H, W), made by one thread per processor core."""
         out = np.empty((len(self), *self.system.shape), self.dtype)
-        runs = list(self._runs())
-
-        def fill(render: Callable[[int], NDArray[Any]], k: int) -> None:
-            out[k] = render(k)
-
-        def fill_run(run: range) -> None:
-            render = self._renderer(self.truth[run[0]])
-            for k in run:
-                fill(render, k)
-
-        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
-            if len(runs) == 1:
-                render = self._renderer(self.truth[0])
-                list(pool.map(lambda k: fill(render, k), runs[0]))
-            else:
-                list(pool.map(fill_run, runs))
+        for k, frame in enumerate(self._frames()):
+            out[k] = frame
         return out
 
     @property
     def dtype(self) -> np.dtype[Any]:
         """Data type of the frames."""
-        return frame_dtype(self.system) if self.settings.quantise else np.dtype(np.float64)
+        return self.chain.dtype
 
     def expected(self, k: int) -> NDArray[np.float64]:
         """Expected image of frame k: without noise, range and rounding; shape (H, W)."""
-        return self._expected(self.truth[k])
+        k = range(len(self))[k]
+        expected = self._expected(k)
+        gain = self.chain.gain(k)
+        return expected if gain is None else expected * gain
 
     def __len__(self) -> int:
         return len(self.truth)
 
     def __getitem__(self, k: int) -> tuple[NDArray[Any], Truth]:
         truth = self.truth[operator.index(k)]
-        return self._renderer(truth)(k % len(self)), truth
+        k %= len(self)
+        return self._renderer(k)(k), truth
 
     def __iter__(self) -> Iterator[tuple[NDArray[Any], Truth]]:
-        for run in self._runs():
-            render = self._renderer(self.truth[run[0]])
-            for k in run:
-                yield render(k), self.truth[k]
+        yield from zip(self._frames(), self.truth, strict=True)
+
+    def _frames(self) -> Iterator[NDArray[Any]]:
+        """All frames in order, a few made ahead by one thread per processor core."""
+        workers = os.cpu_count() or 1
+        waiting: deque[Future[NDArray[Any]]] = deque()
+        with ThreadPoolExecutor(workers) as pool:
+            try:
+                for run in self._runs():
+                    render = pool.submit(self._renderer, run[0])
+                    for k in run:
+                        waiting.append(pool.submit(_render_when_ready, render, k))
+                        if len(waiting) > 2 * workers:
+                            yield waiting.popleft().result()
+                while waiting:
+                    yield waiting.popleft().result()
+            finally:
+                for future in waiting:
+                    future.cancel()
 
     def _runs(self) -> Iterator[range]:
-        """Ranges of consecutive frames of the same pose."""
-        for _, group in groupby(range(len(self)), key=lambda k: id(self.truth[k])):
+        """Ranges of consecutive frames that show the same."""
+
+        def shown(k: int) -> tuple[int, ...]:
+            shifts = self.chain.shifts_um
+            return (id(self.truth[k]), 0 if shifts is None else hash(shifts[k].tobytes()))
+
+        for _, group in groupby(range(len(self)), key=shown):
             first, *rest = group
             yield range(first, first + 1 + len(rest))
 
-    def _expected(self, truth: Truth) -> NDArray[np.float64]:
+    def _expected(self, k: int) -> NDArray[np.float64]:
         s = self.settings
-        return PATHS[s.path](
-            self.system, truth.projection, light_map=s.light_map, dark_map=s.dark_map
+        levels = PATHS[s.path](
+            self.system,
+            self.chain.projection(self.truth[k].projection, k),
+            light_map=s.light_map,
+            dark_map=s.dark_map,
+            deviations=self.chain.deviations,
         )
+        return self.chain.respond(levels)
 
-    def _renderer(self, truth: Truth) -> Callable[[int], NDArray[Any]]:
-        """Function that makes frame k, for frames of this pose."""
-        expected, s = self._expected(truth), self.settings
-        if s.noise:
-            readout = ReadOut(expected, self.system, s.statistics)
-            return lambda k: readout.frame(_stream(self.seed, _FRAMES, k), quantise=s.quantise)
-        if s.quantise:
-            expected = quantise_levels(expected, self.system)
-        return lambda k: expected.copy()
+    def _renderer(self, k: int) -> Callable[[int], NDArray[Any]]:
+        """Function that makes frame k, and all that show the same."""
+        expected, s, chain = self._expected(k), self.settings, self.chain
+        shared: list[ReadOut] = []
+        if s.noise and chain.gain(k) is None:
+            shared.append(ReadOut(expected, chain.system, s.statistics))
+
+        def render(k: int) -> NDArray[Any]:
+            gain = chain.gain(k)
+            levels = expected.copy() if gain is None else expected * gain
+            if s.noise:
+                readout = shared[0] if shared else ReadOut(levels, chain.system, s.statistics)
+                rng = _stream(self.seed, _FRAMES, k)
+                if chain.ordinary:
+                    return readout.frame(rng)
+                levels = readout.frame(rng, quantise=False)
+            return chain.read_out(levels)
+
+        return render
+
+
+def _render_when_ready(render: Future[Callable[[int], NDArray[Any]]], k: int) -> NDArray[Any]:
+    # Pool threads take tasks in order, so the renderer is at work before any of its frames is
+    # waited for: the wait ends.
+    return render.result()(k)
 
 
 def simulate(
@@ -178,6 +188,8 @@ def simulate(
     light_map: LevelMap | float | None = None,
     dark_map: LevelMap | float | None = None,
     path: str = "exact",
+    effects: Any = None,
+    motion: Any = None,
 ) -> Simulation:
     """Simulate frames of a mask at given or random poses.
 
@@ -206,7 +218,13 @@ def simulate(
         Grey levels of white and black over the sensor, see `exact_image`; by default the
         system's levels.
     path : str
-        How the expected image is computed: ``"exact"``.
+        How the expected image is computed: ``"exact"``, or ``"paper"`` as the paper does it.
+    effects : optional
+        Sources of error by name, e.g. ``{"mask_edges": 6.0, "blooming": True}``, or a list of
+        names, ``"name=value"`` or `Effect`; see `rasnik.imaging.effects`.
+    motion : optional
+        A motion or several (`rasnik.imaging.motion`), which add to every pose over its `n`
+        frames at the frame rate of the system.
 
     Returns
     -------
@@ -217,7 +235,8 @@ def simulate(
     ValueError
         If a pose is incomplete or impossible or its (x_um, y_um) is not on the mask (the view
         may reach beyond the mask, which is opaque there), if `n` is below 1, an option is
-        unknown, or noise is wanted and the system does not state it.
+        unknown, noise is wanted and the system does not state it, an effect or motion is
+        impossible or needs what the system does not state, or a motion leaves the mask.
     SystemConfigError
         If the system cannot be read.
     TypeError
@@ -229,20 +248,46 @@ def simulate(
         raise ValueError(f"path must be one of {', '.join(PATHS)}, not {path!r}")
     if statistics not in ("gaussian", "poisson"):
         raise ValueError(f"statistics must be 'gaussian' or 'poisson', not {statistics!r}")
-    if noise and system.noise_law is None:
+    settings = _Settings(noise, statistics, path, light_map, dark_map)
+    if poses is None:
+        positions = _random_positions(system, 1 if motion is not None else n, seed)
+        starts = [parse_pose(system, position, "pose") for position in positions]
+    else:
+        starts = parse_poses(system, poses)
+    if motion is not None:
+        truth = _moving(system, starts, n, motion, seed)
+    else:
+        truth = starts if poses is None else [t for t in starts for _ in range(n)]
+    chain = Chain(
+        make_effects(effects),
+        Context(system, seed, len(truth)),
+        noise if quantise is None else quantise,
+    )
+    if noise and chain.system.noise_law is None:
         raise ValueError(
             f"the noise of system {system.name} is not known: give sensor.noise_a and "
             "sensor.noise_b, or simulate without noise"
         )
-    settings = _Settings(
-        noise, noise if quantise is None else quantise, statistics, path, light_map, dark_map
-    )
-    if poses is None:
-        positions = _random_positions(system, n, seed)
-        truth = [_truth(system, position, "pose") for position in positions]
-    else:
-        truth = [t for t in _truths(system, poses) for _ in range(n)]
-    return Simulation(system, tuple(truth), seed, settings)
+    simulation = Simulation(system, tuple(truth), seed, settings, chain)
+    _ = chain.shifts_um, chain.deviations  # faults show here rather than at the first frame
+    return simulation
+
+
+def _moving(system: System, starts: list[Truth], n: int, motion: Any, seed: int) -> list[Truth]:
+    """n poses from each start on."""
+    motions, rate_hz = make_motions(motion), system.sensor.frame_rate_hz
+    if rate_hz is None:
+        raise ValueError(
+            f"the frame rate of system {system.name} is not known: give sensor.frame_rate_hz "
+            "for a motion"
+        )
+    truth = []
+    for index, start in enumerate(starts):
+        steps = displacements(motions, n, rate_hz, _stream(seed, _MOTION, index))
+        truth += [start.moved(*map(float, step)) for step in steps]
+    for k, pose in enumerate(truth):
+        check_on_mask(system, pose, f"frame {k} of the motion")
+    return truth
 
 
 # ------------------------------------------------------------------------- randomness
@@ -285,104 +330,3 @@ def _seed(seed: int | None) -> int:
     if value < 0:
         raise ValueError(f"seed must not be negative, it is {value}")
     return value
-
-
-# ------------------------------------------------------------------------------ poses
-
-
-def _truths(system: System, poses: Any) -> list[Truth]:
-    if _is_one_pose(poses):
-        return [_truth(system, poses, "pose")]
-    if isinstance(poses, str) or not isinstance(poses, Iterable):
-        raise TypeError(f"poses must be a pose or a sequence of poses, not {poses!r}")
-    truths = [_truth(system, pose, f"pose {k}") for k, pose in enumerate(poses)]
-    if not truths:
-        raise ValueError("poses is empty: give at least one pose, or None for random positions")
-    return truths
-
-
-def _is_one_pose(poses: Any) -> bool:
-    if isinstance(poses, Projection | Mapping) or hasattr(poses, "x_um"):
-        return True
-    if isinstance(poses, np.ndarray):
-        return poses.ndim == 1 and poses.dtype != object
-    return (
-        isinstance(poses, list | tuple)
-        and len(poses) > 0
-        and all(value is None or isinstance(value, Real) for value in poses)
-    )
-
-
-def _truth(system: System, pose: Any, label: str) -> Truth:
-    """The pose in full; `label` names it in messages."""
-    # A `Truth` and an analysed pose may hold more than a similarity.
-    projection = pose if isinstance(pose, Projection) else getattr(pose, "projection", None)
-    if isinstance(projection, Projection):
-        known = getattr(pose, "orientation", None) or None
-        x_um, y_um = projection.x_um, projection.y_um
-        truth = Truth(x_um, y_um, *projection.similarity(known), projection)
-    else:
-        truth = _similarity_truth(system, _pose_values(pose, label), label)
-    x0, x1, y0, y1 = system.mask.bounds_um
-    if not (x0 <= truth.x_um <= x1 and y0 <= truth.y_um <= y1):
-        raise ValueError(
-            f"{label}: ({truth.x_um:g}, {truth.y_um:g}) um is not on the mask, which covers "
-            f"x {x0:g}..{x1:g} um and y {y0:g}..{y1:g} um"
-        )
-    return truth
-
-
-def _pose_values(pose: Any, label: str) -> dict[str, Any]:
-    """The values given, by name; None where left out."""
-    if isinstance(pose, Mapping):
-        for key in pose:
-            if key not in _POSE_NAMES:
-                near = difflib.get_close_matches(str(key), _POSE_NAMES, n=1)
-                hint = f"; did you mean {near[0]}?" if near else ""
-                raise ValueError(
-                    f"{label}: unknown key {key!r}, a pose has {', '.join(_POSE_NAMES)}{hint}"
-                )
-        given = dict(pose)
-    elif hasattr(pose, "x_um"):
-        given = {name: getattr(pose, name, None) for name in _POSE_NAMES}
-    else:
-        try:
-            values = list(pose)
-        except TypeError:
-            raise TypeError(f"{label}: {pose!r} is not a pose (x_um, y_um, ...)") from None
-        if not 2 <= len(values) <= len(_POSE_NAMES):
-            raise ValueError(
-                f"{label}: a pose has 2 to {len(_POSE_NAMES)} values, {', '.join(_POSE_NAMES)}, "
-                f"not {len(values)}"
-            )
-        given = dict(zip(_POSE_NAMES, values, strict=False))
-    values_by_name = {name: given.get(name) for name in _POSE_NAMES}
-    for name in ("x_um", "y_um"):
-        if values_by_name[name] is None:
-            raise ValueError(f"{label}: {name} is missing")
-    return values_by_name
-
-
-def _similarity_truth(system: System, values: Mapping[str, Any], label: str) -> Truth:
-    optics = system.optics
-    defaults = {
-        "theta_rad": optics.theta_rad,
-        "scale": optics.scale,
-        "orientation": optics.orientation or _USUAL_ORIENTATION,
-    }
-    number: dict[str, float] = {}
-    for name in _POSE_NAMES:
-        value = defaults[name] if values[name] is None else values[name]
-        try:
-            number[name] = float(value)
-        except (TypeError, ValueError):
-            raise TypeError(f"{label}: {name} must be a number, not {value!r}") from None
-        if not math.isfinite(number[name]):
-            raise ValueError(f"{label}: {name} must be finite, not {number[name]}")
-    if number["scale"] <= 0:
-        raise ValueError(f"{label}: scale must be positive, not {number['scale']:g}")
-    if number["orientation"] not in (1, 2, 3, 4):
-        raise ValueError(f"{label}: orientation must be 1, 2, 3 or 4, not {values['orientation']}")
-    pose = (number["x_um"], number["y_um"], number["scale"], number["theta_rad"])
-    orientation = int(number["orientation"])
-    return Truth(*pose, orientation, Projection.from_pose(*pose, orientation))
