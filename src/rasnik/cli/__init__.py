@@ -9,6 +9,7 @@ import typer
 from rasnik.cli.analyse import analyse_command
 from rasnik.cli.budget import budget_command
 from rasnik.cli.demo import demo_command
+from rasnik.cli.design import design_command
 from rasnik.cli.mask import mask_command
 from rasnik.cli.predict import predict_command
 from rasnik.cli.simulate import simulate_command
@@ -52,3 +53,4 @@ app.command("demo")(demo_command)
 app.command("mask")(mask_command)
 app.command("predict")(predict_command)
 app.command("budget")(budget_command)
+app.command("design")(design_command)
