@@ -86,7 +86,7 @@ def test_the_step_is_the_change_of_parameters(rng) -> None:
     moved[:8] = 0.05, -0.04, 1e-5, 2e-5, -1e-5, 1.5e-5, 2e-8, -2e-8
     moved[8:20] = rng.uniform(-0.5, 0.5, 12)
     moved[20:23] = 0.1, 0.02, 2.0
-    truth = stepped(state, moved, "projective", 1.0, True)
+    truth = stepped(state, moved, "projective", 1.0)
     image = expected_image(mask, truth.projection, truth.appearance, camera)
     scene = make_scene(mask, state.projection, state.appearance, camera, kurtosis_signal=True)
     valid = np.ones(camera.shape, dtype=np.uint8)

@@ -219,7 +219,7 @@ def _from_prior(
     frame = _with_polarity(frame, prior.polarity)
     start = State(prior.projection, prior.appearance)
     try:
-        result = fit(frame, start, model=model, trust_start=True)
+        result = fit(frame, start, model=model, previous_chi2_ndf=prior.chi2_ndf)
     except ValueError:
         return None
     moved = _motion_fields(frame, start.projection, result.state.projection)

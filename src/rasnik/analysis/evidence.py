@@ -69,9 +69,18 @@ def makes_sense(before: Solution, after: Solution) -> bool:
     )
 
 
-def gain(frame: Frame, solution: Solution, model: Model, kurtosis: bool) -> float:
+def gain(
+    frame: Frame, solution: Solution, model: Model, kurtosis: bool, *, fixed_shape: bool = False
+) -> float:
     """By how much chi-square would fall with the parameters of another model."""
-    rows = design(solution.state, frame.camera, frame.mask.field_um, model, kurtosis)
+    rows = design(
+        solution.state,
+        frame.camera,
+        frame.mask.field_um,
+        model,
+        kurtosis,
+        fixed_shape=fixed_shape,
+    )
     moments = solution.moments
     gradient = rows @ moments.vector
     total = gradient @ solve(rows @ moments.matrix @ rows.T, gradient)

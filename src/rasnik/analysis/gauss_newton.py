@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rasnik.analysis.frame import Frame
 from rasnik.analysis.moments import Moments, gather
-from rasnik.analysis.parameters import POSE_SIZE, Model, State, design, stepped
+from rasnik.analysis.parameters import N_LIGHT, POSE_SIZE, Model, State, design, stepped
 from rasnik.imaging.kernels import TILE
 from rasnik.imaging.model import MIN_BLUR_PX, make_scene
 
@@ -54,12 +54,27 @@ def iterate(
     limit: int,
     trim: bool = False,
     probe: bool = False,
+    fixed_shape: bool = False,
 ) -> Solution:
     """Gauss-Newton with step control, until a step is too small to matter.
 
-    With `probe` the moments include the signal of the kurtosis, for `gain` to try it.
+    Parameters
+    ----------
+    kurtosis : bool
+        Whether the kurtosis of the blur is fitted.
+    tiles : ndarray of int32, shape (n, 2)
+        The part of the image to use.
+    limit : int
+        Most passes over it.
+    trim : bool, optional
+        Leave out tiles that fit much worse than the others.
+    probe : bool, optional
+        Include the signal of the kurtosis in the moments without fitting it, so that
+        `rasnik.analysis.evidence.gain` can tell whether it is needed.
+    fixed_shape : bool, optional
+        Do not fit blur and edges; takes half the time.
     """
-    camera, field = frame.camera, frame.mask.field_um
+    camera, field, n_pose = frame.camera, frame.mask.field_um, POSE_SIZE[model]
     min_blur = MIN_BLUR_PX * camera.pixel_um
     best: Solution | None = None
     best_start = state
@@ -72,31 +87,34 @@ def iterate(
                 state.appearance,
                 camera,
                 kurtosis_signal=kurtosis or probe,
+                shape_signals=not fixed_shape,
             )
         except ValueError:  # a step out of what can be modelled
             if best is None:
                 raise
             damping *= 0.3
-            state = stepped(best_start, damping * best.step, model, min_blur, kurtosis)
+            state = stepped(best_start, damping * best.step, model, min_blur)
             continue
         moments = gather(frame.image, frame.valid, scene, noise, camera, tiles, trim)
-        rows = design(state, camera, field, model, kurtosis)
+        rows = design(state, camera, field, model, kurtosis, fixed_shape=fixed_shape)
         normal = rows @ moments.matrix @ rows.T
         gradient = rows @ moments.vector
         step = solve(normal, gradient)
-        fraction = min(1.0, _MAX_STEP_FIELDS / max(_motion_fields(state, step, frame), 1e-12))
+        fraction = min(
+            1.0, _MAX_STEP_FIELDS / max(_motion_fields(state, step, frame, n_pose), 1e-12)
+        )
         per_pixel = moments.chi2 / max(moments.n_pixels, 1)
         if best is not None and per_pixel > 1.05 * best.moments.chi2 / best.moments.n_pixels:
             damping *= 0.3
             if damping < 0.02:
                 best = replace(best, state=best_start, converged=False)
                 break
-            state = stepped(best_start, damping * best.step, model, min_blur, kurtosis)
+            state = stepped(best_start, damping * best.step, model, min_blur)
             continue
         damping = 1.0
         best_start = state
-        state = stepped(state, fraction * step, model, min_blur, kurtosis)
-        still = _is_last(best_start, step, normal, frame)
+        state = stepped(state, fraction * step, model, min_blur)
+        still = _is_last(best_start, step, normal, frame, n_pose)
         best = Solution(
             state,
             rows,
@@ -107,14 +125,18 @@ def iterate(
             still,
         )
         variance = best_start.appearance.blur_um**2
-        if still and abs(step[POSE_SIZE[model] + 12]) < 0.02 * variance:
+        if still and (fixed_shape or abs(step[n_pose + N_LIGHT]) < 0.02 * variance):
             break
     assert best is not None
     return best
 
 
 def _is_last(
-    state: State, step: NDArray[np.float64], normal: NDArray[np.float64], frame: Frame
+    state: State,
+    step: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    frame: Frame,
+    n_pose: int,
 ) -> bool:
     """Whether what a step leaves undone is below a twentieth of the error.
 
@@ -124,18 +146,16 @@ def _is_last(
     neglected = (TILE / min(frame.camera.shape)) ** 2
     sigma = 1 / np.sqrt(np.maximum(np.diag(normal)[:4], 1e-300))
     return bool(
-        _motion_fields(state, step, frame) < LAST_STEP_FIELDS
+        _motion_fields(state, step, frame, n_pose) < LAST_STEP_FIELDS
         and (np.abs(step[:4]) * neglected < _NEGLIGIBLE * sigma).all()
     )
 
 
-def _motion_fields(state: State, step: NDArray[np.float64], frame: Frame) -> float:
+def _motion_fields(state: State, step: NDArray[np.float64], frame: Frame, n_pose: int) -> float:
     """Largest motion of the pattern over the image that a step makes, in fields."""
     u, v = frame.camera.half_size_um
     reach = np.hypot(u, v) * np.sqrt(abs(np.linalg.det(state.projection.jacobian)))
-    turn = (
-        np.abs(step[2:6]).sum() if len(step) >= POSE_SIZE["affine"] + 14 else np.hypot(*step[2:4])
-    )
+    turn = np.abs(step[2:6]).sum() if n_pose > POSE_SIZE["similarity"] else np.hypot(*step[2:4])
     return float((np.hypot(*step[:2]) + reach * turn) / frame.mask.field_um)
 
 

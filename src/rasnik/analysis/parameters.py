@@ -12,7 +12,7 @@ rotation mean the same in all three.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -31,12 +31,15 @@ from rasnik.analysis.moments import (
 from rasnik.imaging.appearance import Appearance, Camera
 from rasnik.imaging.projection import Projection
 
-__all__ = ["KURTOSIS_RANGE", "POSE_SIZE", "Model", "State", "design", "stepped"]
+__all__ = ["KURTOSIS_RANGE", "N_LIGHT", "POSE_SIZE", "Model", "State", "design", "stepped"]
 
 Model = Literal["similarity", "affine", "projective"]
 
 #: Number of pose parameters: x, y, ln S, theta_z; two shears; two tilts.
 POSE_SIZE: dict[Model, int] = {"similarity": 4, "affine": 6, "projective": 8}
+
+#: Coefficients of the dark and light surfaces.
+N_LIGHT = 2 * N_MONOMIALS
 
 #: Beyond this excess kurtosis the profile would not be one edge any more.
 KURTOSIS_RANGE = (-0.8, 2.4)
@@ -63,19 +66,33 @@ class State:
 
 
 def design(
-    state: State, camera: Camera, field_um: float, model: Model, kurtosis: bool
+    state: State,
+    camera: Camera,
+    field_um: float,
+    model: Model,
+    kurtosis: bool,
+    *,
+    fixed_shape: bool = False,
 ) -> NDArray[np.float64]:
     """How each parameter enters the signals.
+
+    Parameters
+    ----------
+    kurtosis : bool
+        Whether the fourth cumulant of the blur is a parameter.
+    fixed_shape : bool, optional
+        Take blur, edge shift and kurtosis as known.
 
     Returns
     -------
     ndarray, shape (n_parameters, 42)
         Coefficients of (signal, monomial) pairs. Order: x, y (um), ln S, theta_z (rad),
         shears, tilts (1/um); dark and light surfaces (6 each, grey); blur variance
-        (um^2); edge shift (um); fourth cumulant (um^4), if `kurtosis`.
+        (um^2); edge shift (um); fourth cumulant (um^4).
     """
     n_pose = POSE_SIZE[model]
-    rows = np.zeros((n_pose + 14 + kurtosis, _N_SIGNALS, N_MONOMIALS))
+    n_shape = 0 if fixed_shape else 2 + kurtosis
+    rows = np.zeros((n_pose + N_LIGHT + n_shape, _N_SIGNALS, N_MONOMIALS))
     local = state.projection.jacobian / field_um
     hu, hv = camera.half_size_um
     rows[0, MASK_X, _ONE] = rows[1, MASK_Y, _ONE] = 1 / field_um
@@ -92,39 +109,41 @@ def design(
     for k in range(N_MONOMIALS):
         rows[n_pose + k, DARK, k] = 1
         rows[n_pose + N_MONOMIALS + k, LIGHT, k] = 1
-    rows[n_pose + 12, BLUR_VARIANCE, _ONE] = 1
-    rows[n_pose + 13, EDGE_SHIFT, _ONE] = 1 / field_um
-    if kurtosis:
-        rows[n_pose + 14, KURTOSIS, _ONE] = 1
+    shape = rows[n_pose + N_LIGHT :]
+    if n_shape:
+        shape[0, BLUR_VARIANCE, _ONE] = 1
+        shape[1, EDGE_SHIFT, _ONE] = 1 / field_um
+    if n_shape == 3:
+        shape[2, KURTOSIS, _ONE] = 1
     return rows.reshape(len(rows), -1)
 
 
-def stepped(
-    state: State, step: NDArray[np.float64], model: Model, min_blur_um: float, kurtosis: bool
-) -> State:
+def stepped(state: State, step: NDArray[np.float64], model: Model, min_blur_um: float) -> State:
     """The state after a step in the parameters of `design`.
 
     The blur changes by at most a factor of 1.5 in sigma; the excess kurtosis stays in
     `KURTOSIS_RANGE`.
     """
     n_pose = POSE_SIZE[model]
-    projection = _moved(state.projection, step[:n_pose])
-    rest = step[n_pose:]
-    old = state.appearance
-    variance = old.blur_um**2 + rest[12]
+    light, shape = step[n_pose : n_pose + N_LIGHT], step[n_pose + N_LIGHT :]
+    appearance = _reshaped(state.appearance, shape, min_blur_um)
+    appearance = replace(
+        appearance, dark=appearance.dark + light[:6], light=appearance.light + light[6:]
+    )
+    return State(_moved(state.projection, step[:n_pose]), appearance)
+
+
+def _reshaped(old: Appearance, step: NDArray[np.float64], min_blur_um: float) -> Appearance:
+    if not len(step):
+        return old
+    variance = old.blur_um**2 + step[0]
     blur = float(np.sqrt(np.clip(variance, (old.blur_um / 1.5) ** 2, (old.blur_um * 1.5) ** 2)))
     blur = max(blur, min_blur_um)
     excess = old.kurtosis * (old.blur_um / blur) ** 4
-    if kurtosis:
-        excess = float(np.clip(excess + rest[14] / blur**4, *KURTOSIS_RANGE))
-    appearance = Appearance(
-        dark=old.dark + rest[:6],
-        light=old.light + rest[6:12],
-        blur_um=blur,
-        edge_shift_um=old.edge_shift_um + float(rest[13]),
-        kurtosis=excess,
-    )
-    return State(projection, appearance)
+    if len(step) == 3:
+        excess = float(np.clip(excess + step[2] / blur**4, *KURTOSIS_RANGE))
+    shift = old.edge_shift_um + float(step[1])
+    return replace(old, blur_um=blur, edge_shift_um=shift, kurtosis=excess)
 
 
 def _moved(projection: Projection, step: NDArray[np.float64]) -> Projection:

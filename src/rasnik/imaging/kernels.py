@@ -62,6 +62,7 @@ DENSITY = M00 + 11
 ORDERS = np.array(
     [[0, 0], [1, 0], [0, 1], [2, 0], [0, 2], [1, 1], [3, 1], [1, 3], [2, 2], [4, 0], [0, 4]]
 )
+DERIVATIVES = np.array([3, 9, 11])  # how many of them for 3, 4, 5 orders
 SCRATCH = M00 + 12
 WX = SCRATCH + 5
 WY = WX + 5 * 2 * MAX_REACH
@@ -99,8 +100,9 @@ class Scene(NamedTuple):
     reach : int
         Number of fields felt on either side of a corner.
     orders : int
-        Derivatives of the profile that are worked out: 4, or 5 if the signal of the kurtosis
-        is wanted (it is zero otherwise).
+        Derivatives of the profile that are worked out: 3 for position and light alone (with
+        neither corrections nor the signals of blur and edge shift), 4 for all but the
+        kurtosis, 5 for all. Signals that are not worked out are zero.
     """
 
     map: NDArray[np.float64]
@@ -171,7 +173,16 @@ def profiles(work, index, distance, out, table, limit, step, reach, orders):
             work[SCRATCH, lane] = table[i, 0]
             work[SCRATCH + 1, lane] = table[i, 1]
             work[SCRATCH + 2, lane] = table[i, 2]
-            work[SCRATCH + 3, lane] = table[i, 3]
+        if orders == 3:
+            for lane in range(LANES):
+                t = work[out + edge, lane]
+                e1 = work[SCRATCH + 1, lane]
+                e2 = work[SCRATCH + 2, lane]
+                work[out + edge, lane] = work[SCRATCH, lane] + t * (e1 + t * _HALF * e2)
+                work[out + edges + edge, lane] = e1 + t * e2
+            continue
+        for lane in range(LANES):
+            work[SCRATCH + 3, lane] = table[np.uint32(index[2, lane]), 3]
         for lane in range(LANES):
             t = work[out + edge, lane]
             e1 = work[SCRATCH + 1, lane]
@@ -213,12 +224,15 @@ def one_corner(work, index, flat, width, origin, orders):
         work[SCRATCH + 3, lane] = abs(below) * (_ONE - y0) + abs(below + twist) * y0
         work[SCRATCH + 4, lane] = abs(left) * (_ONE - x0) + abs(left + twist) * x0
     for lane in range(LANES):
+        work[M10, lane] = work[EX + 1, lane] * work[SCRATCH + 1, lane]
+        work[M01, lane] = work[EY + 1, lane] * work[SCRATCH + 2, lane]
+    if orders == 3:
+        return
+    for lane in range(LANES):
         along_x = work[SCRATCH + 1, lane]
         along_y = work[SCRATCH + 2, lane]
         x1 = work[EX + 1, lane]
         y1 = work[EY + 1, lane]
-        work[M10, lane] = x1 * along_x
-        work[M01, lane] = y1 * along_y
         work[M20, lane] = work[EX + 2, lane] * along_x
         work[M02, lane] = work[EY + 2, lane] * along_y
         work[DENSITY, lane] = x1 * work[SCRATCH + 3, lane] + y1 * work[SCRATCH + 4, lane]
@@ -247,15 +261,17 @@ def many_corners(work, index, flat, width, origin, reach, orders):
             for lane in range(LANES):
                 k = (index[1, lane] + sy - reach) * width + index[0, lane] - origin + sx - reach
                 work[TT + sy * sides + sx, lane] = flat[np.uint32(k)]
-    for order in range(orders):
+    wanted = 2 if orders == 3 else orders  # E and its first derivative alone
+    for order in range(wanted):
         for sy in range(sides):
             multiply_add(
                 work, SUMS + order * sides + sy, TT + sy * sides, WX + order * sides, sides
             )
-    for k in range(len(ORDERS) if orders == 5 else len(ORDERS) - 2):
+    for k in range(DERIVATIVES[orders - 3]):
         of_x, of_y = ORDERS[k]
         multiply_add(work, M00 + k, SUMS + of_x * sides, WY + of_y * sides, sides)
-    edge_densities(work, reach)
+    if orders > 3:
+        edge_densities(work, reach)
 
 
 @_compiled
@@ -273,7 +289,7 @@ def weights(work, profile, weight, reach, orders):
     """Weights of the fields and their derivatives from the edges between them."""
     sides = 2 * reach
     edges = sides - 1
-    for order in range(orders):
+    for order in range(2 if orders == 3 else orders):
         first = profile + order * edges
         to = weight + order * sides
         for lane in range(LANES):
@@ -354,6 +370,12 @@ def add_part(work, shape, share, orders):
     k04 = share * np.float32(shape[9])
     shift = np.float32(shape[10])
     shared_shift = share * shift
+    if orders == 3:
+        for lane in range(LANES):
+            work[0, lane] += share * work[M10, lane]
+            work[1, lane] += share * work[M01, lane]
+            work[3, lane] += share * work[M00, lane]
+        return
     for lane in range(LANES):
         q11 = work[M11, lane]
         q22 = work[M22, lane]
@@ -406,7 +428,17 @@ def grey_levels(work, photometry, axes, pixel, u_first, v, first):
 
 
 @_compiled
-def weigh(work, image, valid, row0, column0, rows, columns, noise):
+def is_worked_out(signal, orders):
+    """Whether a signal is not just zero."""
+    if orders == 5:
+        return True
+    if orders == 4:
+        return signal != 6
+    return signal < 4 or signal == RESIDUAL
+
+
+@_compiled
+def weigh(work, image, valid, row0, column0, rows, columns, noise, orders):
     """The residual, and all signals times the square root of their weight; returns the count."""
     a, b, floor = np.float32(noise[0]), np.float32(noise[1]), np.float32(noise[2])
     for lane in range(LANES):
@@ -425,8 +457,9 @@ def weigh(work, image, valid, row0, column0, rows, columns, noise):
     for lane in range(LANES):
         work[ROOT, lane] /= np.sqrt(max(a + b * work[LEVEL, lane], floor))
     for signal in range(N_SIGNALS):
-        for lane in range(LANES):
-            work[signal, lane] *= work[ROOT, lane]
+        if is_worked_out(signal, orders):
+            for lane in range(LANES):
+                work[signal, lane] *= work[ROOT, lane]
     return count
 
 
@@ -457,11 +490,13 @@ def gram(image, valid, tiles, noise, scene):
         rows = min(TILE, image.shape[0] - row0)
         columns = min(TILE, image.shape[1] - column0)
         signals(work, index, scene, row0, column0, rows, columns)
-        out[n, N_PRODUCTS] = weigh(work, image, valid, row0, column0, rows, columns, noise)
+        out[n, N_PRODUCTS] = weigh(
+            work, image, valid, row0, column0, rows, columns, noise, scene.orders
+        )
         k = 0
         for a in range(N_SIGNALS):
             for b in range(a, N_SIGNALS):
-                if scene.orders == 5 or (a != 6 and b != 6):
+                if is_worked_out(a, scene.orders) and is_worked_out(b, scene.orders):
                     total = np.float32(0.0)
                     for lane in range(LANES):
                         total += work[a, lane] * work[b, lane]
