@@ -13,9 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from rasnik.mask_files.layout import Box, Plate
+from rasnik.mask_files.layout import Box, MaskFileError, Plate
 
 __all__ = ["Array", "Cell", "field_cells"]
+
+
+#: Counts of arrays in GDSII files have 15 bits.
+_CELL_LIMIT = 2**15 - 1
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,18 @@ def field_cells(plate: Plate) -> list[Cell]:
     """All fields as cells; the last, ``FIELDS``, holds all others and lies in the mask frame.
 
     No two boxes overlap unless the plate has an overlap; then drawn neighbours do.
+
+    Raises
+    ------
+    MaskFileError
+        If the mask has more code cells than layout files can repeat.
     """
+    most = max(plate.mask.column_count, plate.mask.row_count)
+    if most > _CELL_LIMIT:
+        raise MaskFileError(
+            f"the mask has {most} code cells in a row, but layout files repeat a cell at most "
+            f"{_CELL_LIMIT} times; draw a smaller part of it"
+        )
     return _Builder(plate).build()
 
 

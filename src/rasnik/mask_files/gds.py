@@ -11,8 +11,8 @@ from rasnik.mask_files.layout import LAYERS, NM_PER_UM, Box, MaskFileError, Plat
 
 __all__ = ["letter_polygons", "write_layout"]
 
-#: Coordinates of GDSII have 32 bits, the counts of its arrays 15.
-_COORDINATE_LIMIT, _COUNT_LIMIT = 2**31 - 1, 2**15 - 1
+#: Coordinates of GDSII have 32 bits.
+_COORDINATE_LIMIT = 2**31 - 1
 #: The same mask makes the same file: no date of writing.
 _DATE = datetime(2000, 1, 1)
 
@@ -37,11 +37,6 @@ def write_layout(path: Path, plate: Plate) -> None:
     cells: dict[str, Any] = {}
 
     def reference(array: Array) -> object:
-        if max(array.columns, array.rows) > _COUNT_LIMIT:
-            raise MaskFileError(
-                f"the mask has more code cells in a row than layout files can repeat, "
-                f"{2 * _COUNT_LIMIT}; draw a smaller part of it"
-            )
         x, y, dx, dy = (v / NM_PER_UM for v in (array.x, array.y, array.dx, array.dy))
         if array.columns == array.rows == 1:
             return gdstk.Reference(cells[array.cell], (x, y))

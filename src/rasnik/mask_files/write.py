@@ -47,7 +47,19 @@ def write_mask(path: str | PathLike[str], plate: Plate, *, dpi: float | None = N
         raise MaskFileError(f"dpi is for .png; {suffix} files have no pixels")
     if not path.parent.is_dir():
         raise MaskFileError(f"there is no folder {path.parent} to write {path.name} to")
-    match suffix:
+    # Under another name first: a mask that is refused or breaks off leaves nothing behind, and
+    # spares a file that was there.
+    part = path.with_name(f".{path.stem}.part{suffix}")
+    try:
+        _write(part, plate, DEFAULT_DPI if dpi is None else dpi)
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
+
+
+def _write(path: Path, plate: Plate, dpi: float) -> None:
+    match path.suffix:
         case ".gds" | ".oas":
             from rasnik.mask_files.gds import write_layout
 
@@ -56,12 +68,15 @@ def write_mask(path: str | PathLike[str], plate: Plate, *, dpi: float | None = N
             from rasnik.mask_files.dxf import write_dxf
 
             write_dxf(path, plate)
-        case ".png":
+        case ".svg":
+            from rasnik.mask_files.prints import write_svg
+
+            write_svg(path, plate)
+        case ".pdf":
+            from rasnik.mask_files.prints import write_pdf
+
+            write_pdf(path, plate)
+        case _:
             from rasnik.mask_files.raster import write_png
 
-            write_png(path, plate, DEFAULT_DPI if dpi is None else dpi)
-        case _:
-            from rasnik.mask_files import prints
-
-            (prints.write_svg if suffix == ".svg" else prints.write_pdf)(path, plate)
-    return path
+            write_png(path, plate, dpi)
