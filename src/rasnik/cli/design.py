@@ -101,7 +101,7 @@ def design_command(
             _map(design, variations, plot, as_json)
     except (ValueError, TypeError) as error:
         text = str(error)
-        fail(text if text.endswith(".") else f"{text}.")
+        fail(text if text.endswith((".", "?")) else f"{text}.")
 
 
 def _rules(chosen: dict[str, str]) -> Coupling:
@@ -204,9 +204,9 @@ def _print_rest(design: Design) -> None:
     )
     if design.failures:
         reason = next(iter(design.failures.values()))
-        console.print(
-            f"({len(design.failures)} points cannot work; the first: {reason})", markup=False
-        )
+        count = len(design.failures)
+        points = "1 point" if count == 1 else f"{count} points, the first"
+        console.print(f"(left out: {points}: {reason})", markup=False)
 
 
 def _map(design: Design, variations: list[Variation], plot: Any, as_json: bool) -> None:

@@ -64,7 +64,8 @@ class Variation:
     @property
     def logarithmic(self) -> bool:
         """Whether the values span a factor that calls for a logarithmic axis."""
-        return self.values[0] > 0 and self.values[-1] / self.values[0] >= 3
+        small = self.whole and self.values[-1] < 20
+        return not small and self.values[0] > 0 and self.values[-1] / self.values[0] >= 3
 
 
 def parse_variation(text: str, points: int = _DEFAULT_POINTS) -> Variation:
@@ -284,8 +285,10 @@ def explore(
     if best_fields and "mask.field_um" in keys:
         raise ValueError("mask.field_um is varied: it cannot be the best one at every point too")
     for variation in variations:
-        if variation.key not in EXTRA_KEYS:
-            load_system(system, {variation.key: variation.values[0]})  # refuses unknown names
+        if variation.key in EXTRA_KEYS:
+            coupled(system, {variation.key: variation.values[0]})
+        else:
+            load_system(system, {variation.key: variation.values[0]})  # refuses unknown
     return Design(_endless(system), figure, rules or Coupling(), best_fields, rounding)
 
 
