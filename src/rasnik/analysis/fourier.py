@@ -123,6 +123,11 @@ class _Trial:
     pixel_matrix: Array
     samples: FieldSamples
     seen: Coverage
+    power: float  # of the weaker primary
+
+    @property
+    def pixels_per_field(self) -> float:
+        return 1 / math.sqrt(abs(float(np.linalg.det(self.pixel_matrix[:, :2]))))
 
     @property
     def merit(self) -> float:
@@ -174,12 +179,20 @@ def find_lattice(
     if noise_variance is None:
         noise_variance = _noise_floor(picture, spectrum)
     best: _Trial | None = None
+    too_small = 0.0  # power of a lattice below the limit
     for pair in _candidate_pairs(spectrum, picture.windowed.shape[1]):
         trial = _trial(image, valid, picture, pair, noise_variance)
+        if trial is not None and trial.pixels_per_field < LEAST_PIXELS_PER_FIELD:
+            # or a harmonic of a sharp pattern in step with the pixels, weaker than its primaries
+            if trial.agrees(_GOOD_AGREEMENT):
+                too_small = max(too_small, trial.power)
+            continue
         if trial is not None and (best is None or trial.merit > best.merit):
             best = trial
             if trial.agrees(_GOOD_AGREEMENT):
                 break
+    if too_small > 0 and (best is None or best.power < too_small):
+        return Flag.FIELD_TOO_SMALL
     if best is not None and best.agrees(_LEAST_AGREEMENT) and best.seen.fraction < _WHOLE_COVERAGE:
         best = _within_region(image, valid, best, noise_variance)
     if best is None or not best.agrees(_LEAST_AGREEMENT):
@@ -259,7 +272,7 @@ def _trial(
     pixel_matrix = tones.matrix.copy()
     pixel_matrix[:, 2] -= pixel_matrix[:, :2] @ picture.centroid_px
     samples = sample_fields(image, pixel_matrix, picture.bounds_px, valid)
-    return _Trial(tones, picture, pixel_matrix, samples, coverage(samples))
+    return _Trial(tones, picture, pixel_matrix, samples, coverage(samples), float(power.min()))
 
 
 def _within_region(
@@ -305,9 +318,7 @@ def _finish(
     # from (column, row) to micrometres from the centre of the image
     matrix[:, 2] += matrix[:, :2] @ [(width - 1) / 2, (height - 1) / 2]
     matrix[:, :2] /= pixel_um
-    pixels_per_field = 1 / (math.sqrt(abs(np.linalg.det(matrix[:, :2]))) * pixel_um)
-    if pixels_per_field < LEAST_PIXELS_PER_FIELD:
-        return Flag.FIELD_TOO_SMALL if trial.agrees(_GOOD_AGREEMENT) else Flag.NO_MASK
+    pixels_per_field = trial.pixels_per_field
     samples = replace(trial.samples, present=trial.seen.fields)
     levels = fit_levels(samples)
     if levels is None:
