@@ -240,7 +240,8 @@ def exact_pattern(
         grid (distorted images, misplaced pixels). Each is mapped exactly; blur and pixel
         keep their outline.
     edges : EdgeErrors, optional
-        Errors of the printed contours; to second order in their size over the blur.
+        Errors of the printed contours; to second order in their size over the blur, but
+        for the products of two of them where contours cross.
     workers : int
         Threads.
 

@@ -73,9 +73,7 @@ def make_effect(name: str, value: Any = True) -> Effect:
     info = EFFECTS.get(name)
     if info is None:
         near = difflib.get_close_matches(str(name), EFFECTS, n=2, cutoff=0.5)
-        hint = (
-            f"; did you mean {' or '.join(near)}?" if near else f"; they are {', '.join(EFFECTS)}"
-        )
+        hint = f"did you mean {' or '.join(near)}?" if near else f"they are {', '.join(EFFECTS)}"
         raise ValueError(f"there is no effect {name!r}; {hint}")
     if value is False:
         value = 0.0
