@@ -97,6 +97,9 @@ class Scene(NamedTuple):
         Edge profiles along mask X and Y (`rasnik.imaging.profile.EdgeTable`).
     fields : float32, shape (rows, columns)
         1 for white fields; i0, j0 is the index of the first.
+    corners : int32, shape (rows, columns)
+        The colours of the four fields that meet at the lower left corner of each field: bits
+        0..3 for those below left, below, left, and the field itself.
     reach : int
         Number of fields felt on either side of a corner.
     orders : int
@@ -118,6 +121,7 @@ class Scene(NamedTuple):
     limit_y: float
     step_y: float
     fields: NDArray[np.float32]
+    corners: NDArray[np.int32]
     i0: int
     j0: int
     reach: int
@@ -200,20 +204,17 @@ def profiles(work, index, distance, out, table, limit, step, reach, orders):
 
 
 @_compiled
-def one_corner(work, index, flat, width, origin, orders):
+def one_corner(work, index, corners, width, origin, orders):
     """M and its derivatives where a pixel feels the four fields of one corner."""
     for lane in range(LANES):
-        # the corner is the lower-left one of field (cx, cy)
         k = index[1, lane] * width + index[0, lane] - origin
-        work[SCRATCH, lane] = flat[np.uint32(k - width - 1)]
-        work[SCRATCH + 1, lane] = flat[np.uint32(k - width)]
-        work[SCRATCH + 2, lane] = flat[np.uint32(k - 1)]
-        work[SCRATCH + 3, lane] = flat[np.uint32(k)]
+        index[2, lane] = corners[np.uint32(k)]
     for lane in range(LANES):
-        t00 = work[SCRATCH, lane]
-        below = work[SCRATCH + 1, lane] - t00
-        left = work[SCRATCH + 2, lane] - t00
-        twist = work[SCRATCH + 3, lane] - work[SCRATCH + 1, lane] - left
+        colours = index[2, lane]
+        t00 = np.float32(colours & 1)
+        below = np.float32((colours >> 1) & 1) - t00
+        left = np.float32((colours >> 2) & 1) - t00
+        twist = np.float32((colours >> 3) & 1) - t00 - below - left
         x0 = work[EX, lane]
         y0 = work[EY, lane]
         along_x = below + twist * y0
@@ -330,13 +331,12 @@ def pattern(work, index, scene, u, v, columns, rows):
     locate(work, index, scene.map, u, v, scene.pixel_um, columns, rows)
     profiles(work, index, DX, EX, scene.table_x, scene.limit_x, scene.step_x, reach, orders)
     profiles(work, index, DY, EY, scene.table_y, scene.limit_y, scene.step_y, reach, orders)
-    flat = scene.fields.ravel()
     width = np.int32(scene.fields.shape[1])
     origin = np.int32(scene.j0 * scene.fields.shape[1] + scene.i0)
     if reach == 1:
-        one_corner(work, index, flat, width, origin, orders)
+        one_corner(work, index, scene.corners.ravel(), width, origin, orders)
     else:
-        many_corners(work, index, flat, width, origin, reach, orders)
+        many_corners(work, index, scene.fields.ravel(), width, origin, reach, orders)
 
 
 @_compiled

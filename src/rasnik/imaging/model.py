@@ -126,6 +126,7 @@ def make_scene(
         float(tables[1].limit),
         float(tables[1].step),
         fields,
+        _corner_colours(fields),
         i0,
         j0,
         reach,
@@ -164,6 +165,16 @@ def _fields_in_view(
     if max(i1 - i0, j1 - j0) > 4000:
         raise ValueError("the pose puts more than 4000 fields per side in view")
     return np.ascontiguousarray(mask.fields(i0, i1, j0, j1), dtype=np.float32), i0, j0
+
+
+def _corner_colours(fields: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Colours of the fields around each field's lower left corner (`kernels.Scene.corners`)."""
+    white = fields.astype(np.int32)
+    corners = white << 3
+    corners[:, 1:] |= white[:, :-1] << 2
+    corners[1:] |= white[:-1] << 1
+    corners[1:, 1:] |= white[:-1, :-1]
+    return corners
 
 
 def expected_image(
