@@ -87,6 +87,12 @@ class Simulation:
         return out
 
     @property
+    def described(self) -> dict[str, Any]:
+        """How the frames were made, for the record: path, and effects with their parameters."""
+        effects = {e.info.name: e.parameters for e in self.chain.effects}
+        return {"path": self.settings.path, "noise": self.settings.noise, "effects": effects}
+
+    @property
     def dtype(self) -> np.dtype[Any]:
         """Data type of the frames."""
         return self.chain.dtype

@@ -4,8 +4,8 @@ TIFF
     One page per frame. The description of the first page is the truth as JSON.
 HDF5
     ``/frames`` of shape (frames, height, width), one chunk per frame, and ``/truth``, a table
-    with one row per frame. ``/frames`` has the attributes ``software``, ``seed``, ``units`` and
-    ``system_toml``, ``/truth`` those but the system.
+    with one row per frame. ``/frames`` has the attributes ``software``, ``seed``, ``units``,
+    ``simulation`` (JSON) and ``system_toml``, ``/truth`` those but the system.
 Folder
     Images, ``truth.json`` (the same JSON, with the name of each file) and ``system.toml``.
 """
@@ -51,6 +51,8 @@ class Frames(Protocol):
     @property
     def seed(self) -> int: ...
     @property
+    def described(self) -> dict[str, Any]: ...
+    @property
     def dtype(self) -> np.dtype[Any]: ...
     def __len__(self) -> int: ...
     def __iter__(self) -> Any: ...
@@ -69,12 +71,15 @@ class RecordedTruth:
     seed : int
     software : str
         Name and version of the program that wrote them.
+    simulation : dict
+        How they were made: path, noise, and effects with their parameters.
     """
 
     poses: list[dict[str, Any]]
     system: System
     seed: int
     software: str
+    simulation: dict[str, Any]
 
 
 def _header(simulation: Frames) -> dict[str, Any]:
@@ -84,6 +89,7 @@ def _header(simulation: Frames) -> dict[str, Any]:
         "software": f"rasnik {__version__}",
         "seed": simulation.seed,
         "units": UNITS,
+        "simulation": simulation.described,
         "system_toml": simulation.system.to_toml(),
     }
 
@@ -160,7 +166,10 @@ def _write_hdf5(path: Path, simulation: Frames) -> None:
         poses = file.create_dataset("/truth", data=table, track_times=False)
         for key, value in header.items():
             # Seeds may need all 64 bits.
-            stored = np.uint64(value) if key == "seed" and value < 2**64 else str(value)
+            if key == "seed" and value < 2**64:
+                stored: Any = np.uint64(value)
+            else:
+                stored = json.dumps(value) if key == "simulation" else str(value)
             frames.attrs[key] = stored
             if key != "system_toml":
                 poses.attrs[key] = stored
@@ -199,9 +208,10 @@ def read_truth(path: Path | str) -> RecordedTruth:
     try:
         data = json.loads(text)
         parts = list(data["frames"]), data["system_toml"], data["seed"], data["software"]
+        made = dict(data.get("simulation", {}))
     except (ValueError, KeyError, TypeError):
         raise ValueError(f"{path}: there is no truth of simulated frames in it") from None
-    return _recorded(path, *parts)
+    return _recorded(path, *parts, made)
 
 
 def _read_hdf5(path: Path) -> RecordedTruth:
@@ -212,14 +222,21 @@ def _read_hdf5(path: Path) -> RecordedTruth:
         if table is None or frames is None or table.dtype.names != _POSE.names:
             raise ValueError(f"{path}: there is no truth of simulated frames in it")
         rows: NDArray[Any] = table[:]
-        header = {key: frames.attrs[key] for key in ("system_toml", "seed", "software")}
+        header = {
+            key: frames.attrs[key] for key in ("system_toml", "seed", "software", "simulation")
+        }
     poses = [{name: row[name].item() for name in rows.dtype.names or ()} for row in rows]
-    return _recorded(path, poses, header["system_toml"], int(header["seed"]), header["software"])
+    made = json.loads(header["simulation"])
+    return _recorded(
+        path, poses, header["system_toml"], int(header["seed"]), header["software"], made
+    )
 
 
-def _recorded(path: Path, poses: list[Any], toml: str, seed: int, software: str) -> RecordedTruth:
+def _recorded(
+    path: Path, poses: list[Any], toml: str, seed: int, software: str, made: dict[str, Any]
+) -> RecordedTruth:
     try:
         system = System.model_validate(tomllib.loads(toml))
-        return RecordedTruth(poses, system, int(seed), software)
+        return RecordedTruth(poses, system, int(seed), software, made)
     except ValueError as error:
         raise ValueError(f"{path}: the system in it cannot be read: {error}") from None

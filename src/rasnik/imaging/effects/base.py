@@ -81,6 +81,11 @@ class Effect:
 
     info: ClassVar[Info]
 
+    @property
+    def parameters(self) -> dict[str, Any]:
+        """Its parameters by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+
     def system(self, system: System) -> System:
         """The instrument with another sensor or other light."""
         return system
