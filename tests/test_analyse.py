@@ -131,6 +131,20 @@ def test_a_prior_off_by_fields_is_never_believed(fields: tuple[float, float]) ->
     assert pose.flags & Flag.PRIOR_REJECTED
 
 
+def test_a_prior_of_another_orientation_is_refused() -> None:
+    before = analyse(frame_at(), SMALL)
+    with pytest.raises(ValueError, match="leave one of them out"):
+        analyse(frame_at(), SMALL, prior=before, orientation=1)
+
+
+def test_changed_blur_is_noticed_and_fitted_again() -> None:
+    before = analyse(frame_at(), SMALL)
+    softer = load_system(SMALL, ["optics.blur_um=4.8"])
+    pose = analyse(frame_at(system=softer), SMALL, prior=before)
+    assert_at(pose, *POSE[:2])
+    assert pose.blur_um == pytest.approx(4.8, abs=0.02)
+
+
 def test_a_prior_settles_an_ambiguous_view() -> None:
     tiny = load_system("solidras", ["sensor.width_px=130", "sensor.height_px=130"])
     frame = frame_at((20_500.0, 30_300.0, 0.0), tiny)

@@ -101,7 +101,7 @@ def analyse(
     mask, pitch, loaded = resolve_instrument(system, field_um, pixel_um)
     if orientation is None and loaded is not None:
         orientation = loaded.optics.orientation
-    _check_options(method, model, orientation)
+    _check_options(method, model, orientation, prior)
     frame, flags = prepare_frame(image, mask, pitch, loaded, bounds)
     if prior is not None and prior.ok and method == "likelihood":
         pose = _from_prior(frame, prior, model, flags)
@@ -132,7 +132,7 @@ def _with_scale_checked(pose: Pose, system: System | None) -> Pose:
     return replace(pose, flags=pose.flags | Flag.SCALE_UNEXPECTED)
 
 
-def _check_options(method: str, model: str, orientation: int | None) -> None:
+def _check_options(method: str, model: str, orientation: int | None, prior: Pose | None) -> None:
     if method not in ("likelihood", "fourier"):
         raise ValueError(f"method must be 'likelihood' or 'fourier', not {method!r}")
     if model not in ("auto", "similarity", "affine", "projective"):
@@ -143,6 +143,11 @@ def _check_options(method: str, model: str, orientation: int | None) -> None:
         raise ValueError(f"method 'fourier' knows only the similarity, not {model!r}")
     if orientation is not None and orientation not in ORIENTATIONS:
         raise ValueError(f"orientation must be 1, 2, 3 or 4, not {orientation!r}")
+    if prior is not None and prior.ok and orientation not in (None, prior.orientation):
+        raise ValueError(
+            f"the prior pose has orientation {prior.orientation}, but {orientation} is demanded; "
+            "leave one of them out"
+        )
 
 
 def _with_polarity(frame: Frame, polarity: str) -> Frame:
