@@ -14,6 +14,7 @@ from rasnik.analysis.flags import FLAGS
 
 SMALL = load_system("solidras", ["sensor.width_px=300", "sensor.height_px=240"])
 POSE = (20_000.0, 30_000.0, 0.02)
+SIZES = {"field_um": 85.0, "pixel_um": 6.9}
 
 
 def frame_at(pose=POSE, system: System = SMALL, seed: int = 3, **options) -> NDArray:
@@ -237,7 +238,7 @@ def test_bounds_leave_out_the_rest() -> None:
     ("changes", "sentence"),
     [
         ({"system": None}, "size of the fields is needed"),
-        ({"field_um": 85.0, "pixel_um": 6.9}, "not both"),
+        (SIZES, "not both"),
         ({"system": None, "field_um": -85.0, "pixel_um": 6.9}, "field_um must be a positive"),
         ({"system": None, "field_um": 85.0, "pixel_um": np.nan}, "pixel_um must be a positive"),
         ({"system": "solidras"}, "reads out 720 x 540"),
@@ -250,7 +251,7 @@ def test_bounds_leave_out_the_rest() -> None:
         ({"bounds": (200, 10, 100, 200)}, "in order"),
         ({"image": np.zeros((3, 240, 300), np.uint8)}, "two-dimensional array"),
         ({"image": np.zeros((240, 300), complex)}, "two-dimensional array"),
-        ({"image": np.zeros((8, 8), int), "system": None, "field_um": 85, "pixel_um": 7}, "too small"),
+        ({"image": np.zeros((8, 8), int), "system": None, **SIZES}, "too small"),
     ],
 )  # fmt: skip
 def test_wrong_arguments_are_refused(changes: dict, sentence: str) -> None:
