@@ -90,7 +90,7 @@ def camera(light: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(dark + (bright - dark) * light + noise), 0, 255).astype(np.uint8)
 
 
-def assert_found(image: np.ndarray, mask: ChessField, x_um: float, y_um: float, limit=0.02):
+def assert_found(image: np.ndarray, mask: ChessField, x_um: float, y_um: float, limit=0.003):
     system = SYSTEM.model_copy(update={"mask": mask})
     pose = analyse(image, system)
     assert pose.ok, pose.error
