@@ -140,14 +140,15 @@ def _is_last(
 ) -> bool:
     """Whether what a step leaves undone is below a twentieth of the error.
 
-    The cubic part of the error is known from the motion; the linear part is the share of the
-    information that tiles neglect by taking monomials as constant.
+    The cubic part of the error is known from the motion; the linear part, of scale and
+    rotation, is the share of their information that tiles neglect by taking monomials as
+    constant.
     """
     neglected = (TILE / min(frame.camera.shape)) ** 2
-    sigma = 1 / np.sqrt(np.maximum(np.diag(normal)[:4], 1e-300))
+    sigma = 1 / np.sqrt(np.maximum(np.diag(normal)[2:4], 1e-300))
     return bool(
         _motion_fields(state, step, frame, n_pose) < LAST_STEP_FIELDS
-        and (np.abs(step[:4]) * neglected < _NEGLIGIBLE * sigma).all()
+        and (np.abs(step[2:4]) * neglected < _NEGLIGIBLE * sigma).all()
     )
 
 

@@ -168,8 +168,10 @@ def _with_fixed_shape(
     task: _Task, start: State, model: Model | Literal["auto"], previous_chi2_ndf: float
 ) -> Solution | None:
     """The solution with the previous blur and edges; None if it fits less well than then."""
-    coarse = task.run_coarse(start, fixed_shape=True)
-    solution = task.run(coarse.state, 3, fixed_shape=True)
+    solution = task.run(start, 1, fixed_shape=True)
+    if not solution.converged:
+        coarse = task.run_coarse(solution.state, fixed_shape=True)
+        solution = task.run(coarse.state, 3, fixed_shape=True)
     allowed = max(previous_chi2_ndf, 1.0) * 5 * np.sqrt(2 / solution.ndf)
     if not solution.converged or not solution.chi2_ndf < previous_chi2_ndf + allowed:
         return None
