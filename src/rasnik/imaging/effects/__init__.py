@@ -12,7 +12,7 @@ from rasnik.imaging.effects import (  # isort: skip  # in the order an image mee
     response,
     readout,
 )
-from rasnik.imaging.effects.base import EFFECTS, Context, Effect, Info
+from rasnik.imaging.effects.base import EFFECTS, Context, Effect, Info, effects_markdown
 from rasnik.imaging.effects.chain import Chain, make_effect, make_effects
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "Effect",
     "Info",
     "air",
+    "effects_markdown",
     "geometry",
     "light",
     "make_effect",

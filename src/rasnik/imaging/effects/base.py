@@ -19,7 +19,17 @@ from rasnik.imaging.deviations import Deviations
 from rasnik.imaging.projection import Projection, sensor_grid_um
 from rasnik.instrument import System
 
-__all__ = ["EFFECTS", "STAGES", "Context", "Effect", "Image", "Info", "effect"]
+__all__ = [
+    "EFFECTS",
+    "STAGES",
+    "Context",
+    "Effect",
+    "Image",
+    "Info",
+    "check_range",
+    "effect",
+    "effects_markdown",
+]
 
 Image = NDArray[np.float64]
 
@@ -195,3 +205,22 @@ def check_range(name: str, value: float, low: float, high: float = np.inf) -> No
     if not (np.isfinite(value) and low <= value <= high):
         limits = f"at least {low:g}" if high == np.inf else f"between {low:g} and {high:g}"
         raise ValueError(f"effect {name} must be {limits}, not {value:g}")
+
+
+def effects_markdown() -> str:
+    """The table of effects for the documentation."""
+    lines = [
+        "| stage | effect | what it does | parameter | default | unit | more | reference |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for info in EFFECTS.values():
+        name = f"`{info.name}`" + (" (on)" if info.always_on else "")
+        default = "system's" if info.default is None else f"{info.default:g}"
+        more = ", ".join(
+            f"`{key}` = {'system' if value is None else value}" for key, value in info.options
+        )
+        lines.append(
+            f"| {info.stage} | {name} | {info.summary} | `{info.parameter}` | {default} | "
+            f"{info.unit or '1'} | {more} | {info.reference} |"
+        )
+    return "\n".join(lines) + "\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from rasnik.imaging.effects.base import Context, Effect, Image, check_range, effect
 from rasnik.instrument import System
@@ -83,21 +84,40 @@ class Blooming(Effect):
 
     def read_out(self, levels: Image, context: Context) -> Image:
         full = context.system.full_scale if self.full_grey is None else self.full_grey
-        excess = np.maximum(levels - full, 0)
-        levels -= excess
-        down, up = self.share * excess / 2, self.share * excess / 2
-        while down.any() or up.any():
-            down[1:], up[:-1] = down[:-1].copy(), up[1:].copy()
-            down[0] = up[-1] = 0
-            arriving = down + up
-            taken = np.minimum(arriving, np.maximum(full - levels, 0))
-            levels += taken
-            left = np.divide(
-                arriving - taken, arriving, out=np.zeros_like(levels), where=arriving > 0
-            )
-            down *= left
-            up *= left
-        return levels
+        out = np.ascontiguousarray(levels)
+        _spill(out, float(full), self.share)
+        return out
+
+
+@njit(cache=True, nogil=True)
+def _spill(levels, full, share):  # type: ignore[no-untyped-def]
+    """Excess over `full` moves up and down its column at the same pace, filling what has room."""
+    rows = levels.shape[0]
+    down, up = np.empty(rows), np.empty(rows)
+    for column in range(levels.shape[1]):
+        moving = False
+        for row in range(rows):
+            excess = max(levels[row, column] - full, 0.0)
+            levels[row, column] -= excess
+            down[row] = up[row] = share * excess / 2
+            moving = moving or excess > 0
+        while moving:
+            moving = False
+            for row in range(rows - 1, 0, -1):
+                down[row] = down[row - 1]
+            for row in range(rows - 1):
+                up[row] = up[row + 1]
+            down[0] = up[rows - 1] = 0.0
+            for row in range(rows):
+                arriving = down[row] + up[row]
+                if arriving == 0:
+                    continue
+                taken = min(arriving, max(full - levels[row, column], 0.0))
+                levels[row, column] += taken
+                left = (arriving - taken) / arriving
+                down[row] *= left
+                up[row] *= left
+                moving = moving or left > 0
 
 
 @effect(
