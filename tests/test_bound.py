@@ -160,11 +160,12 @@ def test_light_of_solidras() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ("mask.field_um=15", "covers 2.2 pixels"),
+        ("mask.field_um=15", "covers 2.17 pixels"),
         ("optics.blur_um=200", "cannot be seen through a blur of 200 um"),
         ("optics.blur_um=-1", "greater than or equal to 0"),
         ("mask.field_um=1e9", "less than or equal"),
         ("sensor.pixl_um=7", "did you mean sensor.pixel_um"),
+        ("mask.field_um=9000", "the view holds too few contours"),
         ("sensor.noise_a=none", "noise_a and noise_b go together"),
     ],
 )

@@ -212,7 +212,7 @@ def test_command_draws_and_tabulates(tmp_path: Path) -> None:
         (["solidras"], "--vary is needed"),
         (["--vary", "mask.field_um=20:30"], "which system?"),
         (["solidras", "--vary", "mask.feld_um=20:30"], "did you mean mask.field_um"),
-        (["solidras", "--vary", "mask.field_um=1:5"], "covers 0.14 pixels"),
+        (["solidras", "--vary", "mask.field_um=1:5"], "covers 0.145 pixels"),
         (["solidras", "--vary", "mask.field_um=-5:5"], "mask.field_um = -5"),
         (["solidras", "--vary", "sensor.light_factor=-1:1"], "must be a positive number"),
         (["solidras", "--vary", "optics.blur_um=1:2", "--figure", "x"], "figure must be one of"),

@@ -44,6 +44,10 @@ ROUNDING_VARIANCE = 1 / 12
 # The paper's first position, (4000, 5000) um with fields of 85 um, in fields.
 _REFERENCE_FIELDS = (4000 / 85, 5000 / 85)
 
+# The information of a good image, parameters scaled to one, has a condition number of some tens;
+# above this some combination of parameters is not seen.
+_WORST_CONDITION = 1e9
+
 _N_POSE = POSE_SIZE["similarity"]
 
 
@@ -290,14 +294,28 @@ def _check_resolved(system: System, projection: Projection) -> None:
     field_px /= system.pitch_um
     if field_px < LEAST_PIXELS_PER_FIELD:
         raise ValueError(
-            f"a field of {system.mask.field_um:g} um covers {field_px:.2g} pixels of the image; to "
+            f"a field of {system.mask.field_um:g} um covers {field_px:.3g} pixels of the image; to "
             f"be found it must cover {LEAST_PIXELS_PER_FIELD:g}: make fields or scale larger, or "
             "pixels smaller"
         )
 
 
 def _inverse(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of an information matrix whose parameters have very different sizes."""
-    size = 1 / np.sqrt(np.diag(normal))
-    outer = np.outer(size, size)
-    return np.asarray(np.linalg.inv(normal * outer) * outer)
+    """Inverse of an information matrix whose parameters have very different sizes.
+
+    Raises
+    ------
+    ValueError
+        If the image does not determine them all.
+    """
+    diagonal = np.diag(normal)
+    if (diagonal > 0).all():
+        size = 1 / np.sqrt(diagonal)
+        outer = np.outer(size, size)
+        scaled = normal * outer
+        if np.linalg.cond(scaled) < _WORST_CONDITION:
+            return np.asarray(np.linalg.inv(scaled) * outer)
+    raise ValueError(
+        "the view holds too few contours to determine position, scale and rotation along with "
+        "light and blur: make the sensor larger or the fields smaller"
+    )

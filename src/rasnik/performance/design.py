@@ -208,7 +208,7 @@ class Design:
         self._check(figure)
         systems = [system for _, system in points]
         optimum, best = self._refined(variation, figure)
-        near = [v for v, f in zip(variation.values, figure, strict=True) if f <= 1.05 * best]
+        near = _near(variation, figure, 1.05 * best)
         return Curve(
             variation,
             figure,
@@ -217,7 +217,7 @@ class Design:
             _of(systems, _contrast),
             optimum,
             best,
-            (min([*near, optimum]), max([*near, optimum])),
+            (float(min([*near, optimum])), float(max([*near, optimum]))),
             _exponent(variation, figure),
         )
 
@@ -348,6 +348,14 @@ def _contour_mm(system: System) -> float:
 def _contrast(system: System) -> float:
     smear = system.optics.blur_um**2 + system.pitch_um**2 / 12
     return math.exp(-(math.pi**2) * smear / (system.mask.field_um * system.optics.scale) ** 2)
+
+
+def _near(variation: Variation, figure: NDArray[np.float64], limit: float) -> list[float]:
+    """Values at which the figure is below a limit; between the points by interpolation."""
+    good = np.isfinite(figure)
+    values = np.array(variation.values, dtype=float)[good]
+    fine = values if variation.whole else np.linspace(values[0], values[-1], 2001)
+    return list(fine[np.interp(fine, values, figure[good]) <= limit])
 
 
 def _exponent(variation: Variation, figure: NDArray[np.float64]) -> float:
