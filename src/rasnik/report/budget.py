@@ -8,7 +8,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from rasnik.performance.budget import Budget
+from rasnik.performance.budget import Budget, Contribution
 
 __all__ = ["budget_figure", "draw_budget"]
 
@@ -23,9 +23,13 @@ _RANGE = 1e5  # between the longest bar and the shortest that is shown
 
 
 def budget_figure(budget: Budget) -> Figure:
-    """Bars of all contributions that are known and not zero, on a logarithmic axis."""
-    rows = [c for c in budget.contributions if (c.x_nm or 0) > 0 or (c.y_nm or 0) > 0]
-    rows.sort(key=lambda c: max(c.x_nm or 0, c.y_nm or 0))
+    """Bars of all contributions within a factor 1e5 of the largest, on a logarithmic axis."""
+
+    def size(one: Contribution) -> float:
+        return max(one.x_nm or 0.0, one.y_nm or 0.0)
+
+    largest = max(size(one) for one in budget.contributions)
+    rows = sorted((c for c in budget.contributions if size(c) > largest / _RANGE), key=size)
     figure = Figure(figsize=(9.5, 1.9 + 0.33 * len(rows)), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
@@ -34,7 +38,6 @@ def budget_figure(budget: Budget) -> Figure:
         axes.barh(k + 0.19, row.x_nm or 0, 0.36, color=colour)
         axes.barh(k - 0.19, row.y_nm or 0, 0.36, color=colour, alpha=0.55)
     axes.set_xscale("log")
-    largest = max(max(row.x_nm or 0, row.y_nm or 0) for row in rows)
     axes.set_xlim(largest / _RANGE, 3 * largest)
     axes.set_yticks(range(len(rows)), [row.source for row in rows])
     axes.set_ylim(-0.6, len(rows) - 0.4)

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
 from rasnik.performance.coupling import EXTRA_KEYS
@@ -63,6 +63,8 @@ def curve_figure(design: Design, curve: Curve) -> Figure:
     if curve.variation.logarithmic:
         upper.set_xscale("log")
         _plain_ticks(lower, "x")
+    elif curve.variation.whole:
+        lower.xaxis.set_major_locator(MaxNLocator(integer=True))
     for axes in (upper, lower):
         axes.grid(color="#e4e4e4")
         axes.set_axisbelow(True)
