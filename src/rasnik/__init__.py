@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from rasnik.imaging.simulate import simulate
     from rasnik.instrument import System, SystemConfigError, load_system, system_names
     from rasnik.mask import ChessField
+    from rasnik.performance.bound import bound
 
     __version__: str
 
@@ -28,6 +29,7 @@ __all__ = [
     "SystemConfigError",
     "__version__",
     "analyse",
+    "bound",
     "load_system",
     "simulate",
     "system_names",
@@ -41,6 +43,7 @@ _HOME = {
     "System": "rasnik.instrument",
     "SystemConfigError": "rasnik.instrument",
     "analyse": "rasnik.analysis.analyse",
+    "bound": "rasnik.performance.bound",
     "load_system": "rasnik.instrument",
     "simulate": "rasnik.imaging.simulate",
     "system_names": "rasnik.instrument",
