@@ -20,7 +20,9 @@ def environment() -> str:
             model = next(line.split(":")[1].strip() for line in info if "model name" in line)
     except (OSError, StopIteration):
         pass
-    packages = ", ".join(f"{name} {version(name)}" for name in ("rasnik", "numpy", "scipy", "numba"))
+    packages = ", ".join(
+        f"{name} {version(name)}" for name in ("rasnik", "numpy", "scipy", "numba")
+    )
     return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, {packages}"
 
 

@@ -82,7 +82,10 @@ def main() -> None:
         values = values[~lost]
         pulls = values[:, 0] / values[:, 1]
         print(f"\n{method}: {lost.sum()} without result")
-        print(f"{'':>14}{'rms error':>12}{'rms sigma':>12}{'ratio':>8}{'pull std':>10}{'max pull':>10}")
+        print(
+            f"{'':>14}{'rms error':>12}{'rms sigma':>12}{'ratio':>8}"
+            f"{'pull std':>10}{'max pull':>10}"
+        )
         for k, (name, unit) in enumerate(units):
             rms = np.sqrt((values[:, 0, k] ** 2).mean()) * unit
             sigma = np.sqrt((values[:, 1, k] ** 2).mean()) * unit

@@ -33,7 +33,9 @@ def trial(job: tuple[int, bool]) -> dict[str, float | str]:
     """One random image: its conditions, and what became of it."""
     seed, beyond = job
     rng = np.random.default_rng(seed)
-    scale = float(np.exp(rng.uniform(np.log(0.2), np.log(8)) if beyond else rng.uniform(-0.69, 0.69)))
+    scale = float(
+        np.exp(rng.uniform(np.log(0.2), np.log(8)) if beyond else rng.uniform(-0.69, 0.69))
+    )
     pixels_per_field = scale * 85 / 6.9
     blur_fields = rng.uniform(0.02, 0.6 if beyond else 1 / 3)
     # the pixel itself allows no less than 0.3 pixel
@@ -69,7 +71,9 @@ def trial(job: tuple[int, bool]) -> dict[str, float | str]:
         error = float(np.hypot(pose.x_um - expected[0], pose.y_um - expected[1]))
         sigma = float(np.hypot(pose.sigma_x_um, pose.sigma_y_um))
         wrong = error > max(10 * sigma, 0.85) or (fixed and exchanged)
-    outcome = "wrong" if wrong else "ok" if pose.ok else "ambiguous" if pose.candidates else "failed"
+    outcome = (
+        "wrong" if wrong else "ok" if pose.ok else "ambiguous" if pose.candidates else "failed"
+    )
     return {
         "seed": seed,
         "outcome": outcome,
@@ -116,14 +120,16 @@ def _report(results: list[dict[str, float | str]]) -> None:
         count = int((outcomes == name).sum())
         print(f"{name:>10}: {count:6d}  {100 * count / len(results):6.2f} %")
     pulls = np.array([r["pull"] for r in results if r["outcome"] == "ok"])
-    print(f"error / sigma of the good ones: median {np.median(pulls):.2f}, 99 % {np.quantile(pulls, 0.99):.2f}, "
-          f"largest {pulls.max():.2f}")
+    print(
+        f"error / sigma of the good ones: median {np.median(pulls):.2f}, "
+        f"99 % {np.quantile(pulls, 0.99):.2f}, largest {pulls.max():.2f}"
+    )
     for r in results:
         if r["outcome"] != "ok":
             print(
-                f"  {r['outcome']:>9} seed {r['seed']}: {r['pixels_per_field']:.1f} px/field, blur "
-                f"{r['blur_fields']:.2f} fields, contrast {r['contrast']:.0f}, {r['lines']} code lines, "
-                f"{r['flags']}, error {r['error_um']:.3f} um"
+                f"  {r['outcome']:>9} seed {r['seed']}: {r['pixels_per_field']:.1f} px/field, "
+                f"blur {r['blur_fields']:.2f} fields, contrast {r['contrast']:.0f}, "
+                f"{r['lines']} code lines, {r['flags']}, error {r['error_um']:.3f} um"
             )
 
 
@@ -146,7 +152,8 @@ def _plot(results: list[dict[str, float | str]], path: str) -> None:
                 zorder=1 if outcome == "ok" else 2,
             )
         ax.set(xlabel=label, ylabel="blur sigma, fields", xscale="log")
-        ax.legend(loc="upper left")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4)
     figure.suptitle("Finding the mask from nothing: outcome by blur, pixels per field and contrast")
     figure.savefig(path, dpi=110)
 

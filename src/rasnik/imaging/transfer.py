@@ -34,7 +34,7 @@ REACH_SIGMA = 5.4
 
 # The light outside a radius r of a diffraction pattern falls only as 1/r. What lies farther
 # off than the reach is seen as the periodic continuation of the window, whose mean is that of
-# the mask: at this many wavelengths / NA the error is some 1e-5 of the step.
+# the mask: at this many wavelengths / NA the error is some 1e-4 of the step.
 _REACH_AIRY = 60.0
 # The amplitude of coherent light falls more slowly; here the error is some 1e-3.
 _REACH_PUPIL = 240.0
