@@ -106,7 +106,7 @@ def test_uneven_light() -> None:
     white = pattern(projection, 4.5 / PIXEL)
     (u0, v0), (hu, hv) = CAMERA.origin_um, CAMERA.half_size_um
     basis = surface((u0 + np.arange(90) * PIXEL) / hu, (v0 + np.arange(70)[:, None] * PIXEL) / hv)
-    expected = np.tensordot(dark, basis, 1) * (1 - white) + np.tensordot(light, basis, 1) * white
+    expected = (basis @ dark) * (1 - white) + (basis @ light) * white
     assert np.abs(image - expected).max() < 1e-3
 
 

@@ -14,9 +14,9 @@ from scipy.ndimage import map_coordinates
 from rasnik.analysis.decode import Decoding, LabelledLattice
 from rasnik.analysis.flags import Flag
 from rasnik.analysis.lattice import Lattice
-from rasnik.analysis.levels import quadratic_basis
 from rasnik.analysis.pose import Candidate, Pose
 from rasnik.analysis.tones import combine, measure, phase_errors
+from rasnik.imaging.appearance import surface
 from rasnik.imaging.projection import Projection
 from rasnik.mask import ChessField
 
@@ -194,7 +194,7 @@ def _contrast(lattice: Lattice, u: Array, v: Array) -> Array:
     """Half the black-white step at points in pixels from the window's centroid."""
     height, width = lattice.shape
     column, row = lattice.picture.centroid_px
-    basis = quadratic_basis(
+    basis = surface(
         (u + column - (width - 1) / 2) * 2 / width, (v + row - (height - 1) / 2) * 2 / height
     )
     level: Array = basis @ lattice.levels.half

@@ -80,8 +80,8 @@ class Lattice:
     def dark(self) -> Array:
         """Grey level of wide black areas, shape (6,).
 
-        Coefficients of ``1, u, v, u^2, u v, v^2`` (`quadratic_basis`), with the sensor coordinates
-        divided by half the image's width and height.
+        Coefficients of ``1, u, v, u^2, u v, v^2`` (`rasnik.imaging.appearance.surface`), with
+        the sensor coordinates divided by half the image's width and height.
         """
         return self.levels.middle - self.levels.half
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rasnik.analysis.sampling import FieldSamples
+from rasnik.imaging.appearance import surface
 
-__all__ = ["Levels", "fit_levels", "neighbour_sums", "quadratic_basis", "safe_half"]
+__all__ = ["Levels", "fit_levels", "neighbour_sums", "safe_half"]
 
 Array = NDArray[np.float64]
 
@@ -22,12 +23,6 @@ _LEAST_FIELDS = 20
 _MOST_MIXING = 0.8
 
 
-def quadratic_basis(u: ArrayLike, v: ArrayLike) -> Array:
-    """The terms 1, u, v, u^2, u v, v^2 in the last axis; `u` and `v` broadcast."""
-    u, v = np.broadcast_arrays(np.asarray(u, float), np.asarray(v, float))
-    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
-
-
 @dataclass(frozen=True, eq=False)
 class Levels:
     """Grey levels of the fields: g = middle + half x (own s0 + side s4 + diagonal d4).
@@ -38,7 +33,7 @@ class Levels:
     Attributes
     ----------
     middle, half : ndarray, shape (6,)
-        Coefficients of `quadratic_basis`.
+        Coefficients of `rasnik.imaging.appearance.surface`.
     own, side, diagonal : float
         Part of a field's light that comes from itself and from each neighbour.
     scatter : float
@@ -87,7 +82,7 @@ def fit_levels(samples: FieldSamples) -> Levels | None:
         return None
     thin = _scattered(len(rows), _MOST_FIELDS_FITTED)
     fitted = rows[thin], columns[thin]
-    whole_basis = quadratic_basis(samples.u[rows, columns], samples.v[rows, columns])
+    whole_basis = surface(samples.u[rows, columns], samples.v[rows, columns])
     basis, whole_grey = whole_basis[thin], samples.grey[rows, columns]
     grey = whole_grey[thin]
     colour = chess.copy()

@@ -102,7 +102,7 @@ def _monomials(
     (u0, v0), (hu, hv) = camera.origin_um, camera.half_size_um
     u = (u0 + centre[:, 1] * camera.pixel_um) / hu
     v = (v0 + centre[:, 0] * camera.pixel_um) / hv
-    basis = np.ascontiguousarray(surface(u, v).T)
+    basis = surface(u, v)
     first, second = np.triu_indices(N_MONOMIALS)
     return basis, basis[:, first] * basis[:, second]
 

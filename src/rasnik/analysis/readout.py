@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rasnik.analysis.lattice import Lattice
-from rasnik.analysis.levels import Levels, neighbour_sums, quadratic_basis, safe_half
+from rasnik.analysis.levels import Levels, neighbour_sums, safe_half
 from rasnik.analysis.sampling import FieldSamples
+from rasnik.imaging.appearance import surface
 
 __all__ = ["LLR_BOUND_BRIGHT", "LLR_BOUND_DARK", "Readout", "read_fields", "read_levels"]
 
@@ -60,7 +61,7 @@ def read_fields(lattice: Lattice) -> Readout:
 def read_levels(samples: FieldSamples, levels: Levels) -> Readout:
     """Evidence for inversion, given the grey levels of the fields."""
     chess = samples.chess
-    basis = quadratic_basis(samples.u, samples.v)
+    basis = surface(samples.u, samples.v)
     half = safe_half(basis @ levels.half)
     side_sum, diagonal_sum = neighbour_sums(levels.colour, chess)
     context = levels.side * side_sum + levels.diagonal * diagonal_sum

@@ -55,16 +55,15 @@ class Camera:
         return float(u.mean()), float(v.mean())
 
 
-def surface(u: ArrayLike, v: ArrayLike, order: int = 2) -> NDArray[np.float64]:
-    """Monomials 1, u, v, u^2, uv, v^2 (up to `order`) of normalised coordinates.
+def surface(u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+    """Monomials 1, u, v, u^2, uv, v^2 of normalised coordinates; `u` and `v` broadcast.
 
     Returns
     -------
-    ndarray, shape (1 or 3 or 6, ...)
+    ndarray, shape (..., 6)
     """
     u, v = np.broadcast_arrays(np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64))
-    terms = [np.ones_like(u), u, v, u * u, u * v, v * v]
-    return np.stack(terms[: (order + 1) * (order + 2) // 2])
+    return np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=-1)
 
 
 @dataclass(frozen=True, eq=False)

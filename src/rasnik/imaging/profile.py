@@ -90,9 +90,7 @@ def _fill(table, nodes, weights, sigma, limit, step, kurtosis):  # type: ignore[
         )
 
 
-def edge_table(
-    sigma: float, pixel_widths: tuple[float, float], kurtosis: float = 0.0
-) -> EdgeTable:
+def edge_table(sigma: float, pixel_widths: tuple[float, float], kurtosis: float = 0.0) -> EdgeTable:
     """Tabulate the edge profile along one axis of the mask.
 
     Parameters

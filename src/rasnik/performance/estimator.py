@@ -107,7 +107,7 @@ def estimator(system: System, projection: Projection) -> Estimator:
     for row, out in zip(rows, derivatives, strict=True):
         total = np.zeros(expected.shape, dtype=np.float32)
         for signal, monomial in zip(*np.nonzero(row), strict=True):
-            total += np.float32(row[signal, monomial]) * signals[signal] * monomials[monomial]
+            total += np.float32(row[signal, monomial]) * signals[signal] * monomials[..., monomial]
         out[:] = total.ravel()
     weight = (1 / (noise[0] + noise[1] * expected)).ravel()
     size = np.sqrt((derivatives**2 @ weight).astype(np.float64))

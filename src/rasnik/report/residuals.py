@@ -85,7 +85,7 @@ def _better_look(
     rows, columns = rows[::stride], columns[::stride]
     height, width = camera.shape
     u, v = (2 * columns - width + 1) / width, (2 * rows - height + 1) / height
-    light, white = surface(u, v), level[rows, columns]
+    light, white = surface(u, v).T, level[rows, columns]
     terms = [*(light * (1 - white)), *(light * white)]
     terms += [slope[rows, columns] for _, slope in changes]
     found = _robust_solution(np.array(terms, dtype=np.float64).T, image[rows, columns])
