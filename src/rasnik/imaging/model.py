@@ -84,7 +84,7 @@ def make_scene(
     """
     field = mask.field_um
     to_fields = np.diag([1 / field, 1 / field, 1.0]) @ projection.matrix
-    jacobian = _local_jacobian(to_fields, camera.centre_um)
+    jacobian = projection.jacobian_at(*camera.centre_um) / field
     pixel = camera.pixel_um
     blur = max(appearance.blur_um, MIN_BLUR_PX * pixel)
     parts = _pixel_parts(jacobian, pixel, blur)
@@ -145,15 +145,6 @@ def _corrections_are_negligible(shape: list[float], tables: list[EdgeTable]) -> 
         + abs(shape[10]) * (x[1] + y[1])
     )
     return bool(largest < _NEGLIGIBLE)
-
-
-def _local_jacobian(matrix: NDArray[np.float64], point: tuple[float, float]) -> NDArray[np.float64]:
-    homogeneous = matrix @ np.array([*point, 1.0])
-    w = homogeneous[2]
-    jacobian: NDArray[np.float64] = (
-        matrix[:2, :2] - np.outer(homogeneous[:2] / w, matrix[2, :2])
-    ) / w
-    return jacobian
 
 
 def _fields_in_view(

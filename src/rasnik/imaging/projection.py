@@ -98,8 +98,14 @@ class Projection:
     @property
     def jacobian(self) -> NDArray[np.float64]:
         """d(X, Y) / d(u, v) at the reference point, shape (2, 2)."""
+        return self.jacobian_at(0.0, 0.0)
+
+    def jacobian_at(self, u_um: float, v_um: float) -> NDArray[np.float64]:
+        """d(X, Y) / d(u, v) at a point of the sensor, shape (2, 2)."""
         m = self.matrix
-        return m[:2, :2] - np.outer(m[:2, 2], m[2, :2])
+        x, y, w = m @ (u_um, v_um, 1.0)
+        jacobian: NDArray[np.float64] = (m[:2, :2] - np.outer([x / w, y / w], m[2, :2])) / w
+        return jacobian
 
     @property
     def mirrored(self) -> bool:

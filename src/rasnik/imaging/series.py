@@ -189,7 +189,7 @@ class Scene:
         u, v = sensor_grid_um(self.shape, self.pitch_um)
         u = u[[tile.column, tile.column + tile.width - 1]]
         v = v[[tile.row, tile.row + tile.height - 1]]
-        jacobian = _local_jacobian(self.projection, float(u.mean()), float(v.mean()))
+        jacobian = self.projection.jacobian_at(float(u.mean()), float(v.mean()))
         corners = self.projection.to_mask(u, v[:, None])
         if self._on_mask is not None:
             corners = tuple(part[tile.rows, tile.columns] for part in self._on_mask)  # type: ignore[assignment]
@@ -322,11 +322,3 @@ def _sinc_of_sum(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.f
     sine[zero] = total[zero] = 1.0
     sine /= total
     return sine
-
-
-def _local_jacobian(projection: Projection, u: float, v: float) -> NDArray[np.float64]:
-    """d(X, Y) / d(u, v) at a point of the sensor."""
-    m = projection.matrix
-    w = m[2, 0] * u + m[2, 1] * v + 1
-    x, y = projection.to_mask(u, v)
-    return (m[:2, :2] - np.outer([float(x), float(y)], m[2, :2])) / w
