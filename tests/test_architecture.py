@@ -23,6 +23,7 @@ ROOMS = (
     "mask_files",
     "imaging",
     "analysis",
+    "tracking",
     "performance",
     "io",
     "report",

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from rasnik.instrument import System, SystemConfigError, load_system, system_names
     from rasnik.mask import ChessField
     from rasnik.performance.bound import bound
+    from rasnik.tracking.track import Track
+    from rasnik.tracking.tracker import Tracker
 
     __version__: str
 
@@ -27,6 +29,8 @@ __all__ = [
     "Projection",
     "System",
     "SystemConfigError",
+    "Track",
+    "Tracker",
     "__version__",
     "analyse",
     "bound",
@@ -42,6 +46,8 @@ _HOME = {
     "Projection": "rasnik.imaging.projection",
     "System": "rasnik.instrument",
     "SystemConfigError": "rasnik.instrument",
+    "Track": "rasnik.tracking.track",
+    "Tracker": "rasnik.tracking.tracker",
     "analyse": "rasnik.analysis.analyse",
     "bound": "rasnik.performance.bound",
     "load_system": "rasnik.instrument",

@@ -33,6 +33,14 @@ class Flag(IntFlag):
     PRIOR_REJECTED = 1 << 15
     LOW_CONTRAST = 1 << 16
     SCALE_UNEXPECTED = 1 << 17
+    NO_IMAGE = 1 << 18
+    REFITTED = 1 << 19
+    COLD_START = 1 << 20
+    MOVED = 1 << 21
+    LIGHT_CHANGED = 1 << 22
+    OBSTRUCTED = 1 << 23
+    FRAMES_LOST = 1 << 24
+    TIME_IRREGULAR = 1 << 25
 
     @property
     def names(self) -> list[str]:
@@ -165,5 +173,53 @@ FLAGS: tuple[FlagInfo, ...] = (
         "The scale differs from the system's by more than 20 %. If the mask has another field "
         "size than the system says, the position is wrong by the same factor.",
         "Check mask.field_um, sensor.pixel_um, sensor.binning and optics.scale.",
+    ),
+    FlagInfo(
+        Flag.NO_IMAGE,
+        True,
+        "There is no image for this frame, or it is not of the instrument's size.",
+        "Check the file or the camera, and sensor.width_px, height_px and binning.",
+    ),
+    FlagInfo(
+        Flag.REFITTED,
+        False,
+        "While tracking, this frame had to be fitted on its own; other flags say why.",
+        "None needed.",
+    ),
+    FlagInfo(
+        Flag.COLD_START,
+        False,
+        "Tracking began here, or began again: the mask was found from nothing.",
+        "None needed.",
+    ),
+    FlagInfo(
+        Flag.MOVED,
+        False,
+        "The mask moved further between frames than tracking follows.",
+        "None needed; a higher frame rate makes the steps smaller.",
+    ),
+    FlagInfo(
+        Flag.LIGHT_CHANGED,
+        False,
+        "The light changed by more than tracking allows.",
+        "Check the light source and the exposure.",
+    ),
+    FlagInfo(
+        Flag.OBSTRUCTED,
+        False,
+        "A part of the image differs from what was tracked: something is in the way.",
+        "Check that the view is free and the optics are clean.",
+    ),
+    FlagInfo(
+        Flag.FRAMES_LOST,
+        False,
+        "Frames are missing just before this one.",
+        "Check the camera's connection, and that frames are taken off it fast enough.",
+    ),
+    FlagInfo(
+        Flag.TIME_IRREGULAR,
+        False,
+        "The time of this frame does not follow that of the frame before.",
+        "Check the camera's clock.",
     ),
 )

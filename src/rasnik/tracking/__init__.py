@@ -1,0 +1,1 @@
+"""Following a mask through a stream of frames, at camera rate and at the bound."""
