@@ -18,18 +18,20 @@ killed, with ``h5py.File(path, "r", swmr=True)``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from rasnik.analysis.flags import FLAGS
-from rasnik.io.columns import COLUMNS, check_record, flag_value
+from rasnik.io.columns import COLUMNS, Column, check_record, flag_value
 from rasnik.io.results import Record, ResultWriter, joined
+from rasnik.tracking.track import TrackColumn
 
-__all__ = ["Hdf5Writer", "read_hdf5"]
+__all__ = ["Hdf5Writer", "append_rows", "describe_table", "read_hdf5"]
 
 _TEXT_BYTES = 1024
 _CHUNK_ROWS = 256
@@ -59,14 +61,7 @@ class Hdf5Writer(ResultWriter):
         self._texts = self._table("texts", np.dtype(f"S{_TEXT_BYTES}"), chunk_rows=32)
         self._candidates = self._table("candidates", _CANDIDATE, chunk_rows=32)
         self._known_texts: dict[str, int] = {}
-        attributes = self._results.attrs
-        attributes["columns"] = [column.name for column in _TABLE_COLUMNS]
-        attributes["units"] = [column.unit for column in _TABLE_COLUMNS]
-        attributes["descriptions"] = [column.description for column in _TABLE_COLUMNS]
-        attributes["flag_masks"] = np.array([int(info.flag) for info in FLAGS], dtype="u4")
-        attributes["flag_meanings"] = " ".join(info.name for info in FLAGS)
-        for key, value in metadata.items():
-            attributes[key] = value
+        describe_table(self._results, _TABLE_COLUMNS, metadata)
         self._file.swmr_mode = True
 
     def _table(self, name: str, dtype: np.dtype[Any], chunk_rows: int = _CHUNK_ROWS) -> Any:
@@ -84,7 +79,7 @@ class Hdf5Writer(ResultWriter):
                 cut = (_TEXT_BYTES - 5) // 2
                 head, tail = encoded[:cut].decode(errors="ignore"), encoded[-cut:]
                 encoded = f"{head} ... {tail.decode(errors='ignore')}".encode()[:_TEXT_BYTES]
-            self._known_texts[text] = _append(self._texts, np.array([encoded], dtype="S"))
+            self._known_texts[text] = append_rows(self._texts, np.array([encoded], dtype="S"))
         return self._known_texts[text]
 
     def write(self, record: Record) -> None:
@@ -106,19 +101,33 @@ class Hdf5Writer(ResultWriter):
         for candidate in record.get("candidates") or ():
             values = {"row": len(self._results), **candidate}
             line = tuple(np.nan if values[n] is None else values[n] for n in _CANDIDATE.names or ())
-            _append(self._candidates, np.array([line], dtype=_CANDIDATE))
+            append_rows(self._candidates, np.array([line], dtype=_CANDIDATE))
         # What the row refers to is on the disk before the row.
-        _append(self._results, row)
+        append_rows(self._results, row)
 
     def close(self) -> None:
         self._file.close()
 
 
-def _append(dataset: Any, row: Any) -> int:
-    """Add a row, flush it, and tell its index."""
+def describe_table(
+    dataset: Any, columns: Sequence[Column | TrackColumn], metadata: Mapping[str, Any]
+) -> None:
+    """Say in attributes what the columns and flags of a table mean, and add the metadata."""
+    attributes = dataset.attrs
+    attributes["columns"] = [column.name for column in columns]
+    attributes["units"] = [column.unit for column in columns]
+    attributes["descriptions"] = [column.description for column in columns]
+    attributes["flag_masks"] = np.array([int(info.flag) for info in FLAGS], dtype="u4")
+    attributes["flag_meanings"] = " ".join(info.name for info in FLAGS)
+    for key, value in metadata.items():
+        attributes[key] = value
+
+
+def append_rows(dataset: Any, rows: NDArray[Any]) -> int:
+    """Add rows, flush them, and tell the index of the first."""
     index = len(dataset)
-    dataset.resize((index + 1,))
-    dataset[index:] = row
+    dataset.resize((index + len(rows),))
+    dataset[index:] = rows
     dataset.flush()
     return int(index)
 

@@ -7,13 +7,16 @@ crash that file holds every record; `rasnik.io.results.read_results` reads it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from rasnik.io.columns import COLUMNS, flag_value
+from numpy.typing import NDArray
+
+from rasnik.io.columns import COLUMNS, Column, flag_value
 from rasnik.io.results import JsonLinesWriter, Record, ResultWriter, joined, read_json_lines
+from rasnik.tracking.track import TrackColumn
 
 try:
     import pyarrow
@@ -23,7 +26,13 @@ except ImportError as error:
         'Parquet files need pyarrow; install it with: pip install "rasnik[parquet]"'
     ) from error
 
-__all__ = ["ParquetWriter", "partial_path", "read_parquet"]
+__all__ = [
+    "ParquetWriter",
+    "partial_path",
+    "read_columns",
+    "read_parquet",
+    "write_columns",
+]
 
 _BATCH_ROWS = 50_000
 
@@ -51,9 +60,14 @@ def _schema(metadata: dict[str, str]) -> Any:
         kind = types.get(column.kind, pyarrow.string())
         if column.name == "candidates":
             kind = pyarrow.list_(candidate)
-        about = {"unit": column.unit, "description": column.description}
-        fields.append(pyarrow.field(column.name, kind, metadata=about))
+        fields.append(_field(column, kind))
     return pyarrow.schema(fields, metadata=metadata)
+
+
+def _field(column: Column | TrackColumn, kind: Any) -> Any:
+    """A column of a table, with its unit and meaning."""
+    about = {"unit": column.unit, "description": column.description}
+    return pyarrow.field(column.name, kind, metadata=about)
 
 
 def _row(record: Record) -> dict[str, Any]:
@@ -108,3 +122,33 @@ def read_parquet(path: Path) -> Iterator[dict[str, Any]]:
                 yield from batch.to_pylist()
     except pyarrow.ArrowInvalid as error:
         raise ValueError(f"{path}: this is not a complete Parquet file ({error})") from error
+
+
+def write_columns(
+    path: Path,
+    columns: Sequence[TrackColumn],
+    arrays: Mapping[str, NDArray[Any]],
+    metadata: Mapping[str, str],
+) -> None:
+    """Write arrays of numbers as a Parquet file, in the order of `columns`."""
+    fields = [_field(c, pyarrow.from_numpy_dtype(arrays[c.name].dtype)) for c in columns]
+    schema = pyarrow.schema(fields, metadata=dict(metadata))
+    parquet.write_table(pyarrow.table([arrays[c.name] for c in columns], schema=schema), path)
+
+
+def read_columns(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """(arrays, metadata) of a Parquet file.
+
+    Raises
+    ------
+    ValueError
+        If the file is not Parquet.
+    """
+    try:
+        table = parquet.read_table(path)
+    except pyarrow.ArrowInvalid as error:
+        raise ValueError(f"{path}: this is not a complete Parquet file ({error})") from error
+    metadata = {
+        key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()
+    }
+    return {name: table.column(name).to_numpy() for name in table.column_names}, metadata
