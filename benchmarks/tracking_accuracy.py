@@ -16,6 +16,7 @@ which shares no formula with the fit or the tracker.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -26,8 +27,8 @@ import _study
 _study.one_thread()
 
 import numpy as np  # noqa: E402
+import rich.progress  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
-from rich.progress import track as shown  # noqa: E402
 
 from rasnik import Flag, Track, Tracker, analyse, bound, load_system, simulate  # noqa: E402
 from rasnik.analysis.pose import PARAMETERS  # noqa: E402
@@ -68,6 +69,12 @@ class Metered:
                 self.kept[k] = frame
             yield frame
             k += 1
+
+
+def shown(frames: Iterable[np.ndarray], label: str, total: int) -> Iterable[np.ndarray]:
+    """The frames, with a progress bar where somebody may be looking."""
+    quiet = not sys.stdout.isatty()
+    return rich.progress.track(frames, label, total, transient=True, disable=quiet)
 
 
 def values(track: Track) -> np.ndarray:
@@ -121,7 +128,7 @@ def still(pose: tuple[float, ...], n: int, seed: int, fit_every: int) -> Still:
     least = np.sqrt(np.diag(bound(SYSTEM, truth, rounding=True).covariance))
     frames = Metered((frame for frame, _ in simulation), fit_every)
     begin = time.perf_counter()
-    track = Tracker(SYSTEM).run(shown(frames, description=f"{pose}", total=n, transient=True))
+    track = Tracker(SYSTEM).run(shown(frames, f"{pose}", n))
     rate = n / (time.perf_counter() - begin - frames.waited_s)
     found = values(track)
     errors = found - [getattr(truth, name) for name in PARAMETERS]
@@ -229,7 +236,7 @@ def walk(options: argparse.Namespace) -> None:
         max(1, options.walk // options.walk_fits),
     )
     begin = time.perf_counter()
-    track = Tracker(SYSTEM).run(shown(frames, description="walk", total=len(poses), transient=True))
+    track = Tracker(SYSTEM).run(shown(frames, "walk", len(poses)))
     rate = len(poses) / (time.perf_counter() - begin - frames.waited_s)
     errors = 1e6 * (values(track)[:, :2] - poses[:, :2])
     kept = np.array(list(frames.kept))
