@@ -16,7 +16,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["IMAGE_SUFFIXES", "STACK_SUFFIXES", "ImageFileError", "Stack", "open_stack", "to_grey"]
+__all__ = [
+    "IMAGE_SUFFIXES",
+    "STACK_SUFFIXES",
+    "VIDEO_SUFFIXES",
+    "EndOfStack",
+    "ImageFileError",
+    "Stack",
+    "open_stack",
+    "to_grey",
+]
 
 Image = NDArray[Any]
 
@@ -24,12 +33,22 @@ Image = NDArray[Any]
 IMAGE_SUFFIXES = tuple(".png .tif .tiff .gif .bmp .pgm .ppm .pnm .npy .jpg .jpeg".split())
 #: HDF5 files hold images or results; they are read when named or matched by a pattern.
 STACK_SUFFIXES = (".h5", ".hdf5")
+#: A folder is searched for videos if it holds no images.
+VIDEO_SUFFIXES = tuple(".mkv .avi .mp4 .m4v .mov .webm .mpg .mpeg .wmv .y4m .nut".split())
 
 LUMINANCE = (0.299, 0.587, 0.114)
 
 
 class ImageFileError(ValueError):
     """An image cannot be read; the message says what is wrong and what to do about it."""
+
+
+class EndOfStack(Exception):  # noqa: N818 -- not an error, as StopIteration is none
+    """There are no frames from this one on, in a stack that could not count them beforehand."""
+
+    def __init__(self, count: int, error: str | None = None) -> None:
+        super().__init__(f"the stack has {count} frames")
+        self.count, self.error = count, error
 
 
 @dataclass(frozen=True)
@@ -44,11 +63,15 @@ class Stack:
         ``read(index)`` gives the image, shape (height, width), and notes on what was done to it.
     error : str, optional
         What is wrong with the file after the last of these frames.
+    counted : bool
+        False: `count` is what the file promises, and `read` raises `EndOfStack` after the last
+        frame that is there.
     """
 
     count: int
     read: Callable[[int], tuple[Image, tuple[str, ...]]]
     error: str | None = None
+    counted: bool = True
 
 
 def to_grey(colours: Image) -> Image:
@@ -315,6 +338,12 @@ def _open_tiff(path: Path) -> AbstractContextManager[Stack]:
     return open_tiff(path)
 
 
+def _open_video(path: Path) -> AbstractContextManager[Stack]:
+    from rasnik.io.video import open_video
+
+    return open_video(path)
+
+
 _MAGIC: tuple[tuple[bytes, Callable[[Path], AbstractContextManager[Stack]]], ...] = (
     (b"\x89PNG", open_pillow),
     (b"GIF8", open_pillow),
@@ -331,6 +360,13 @@ _MAGIC: tuple[tuple[bytes, Callable[[Path], AbstractContextManager[Stack]]], ...
     (b"\x93NUMPY", _open_npy),
 )
 _HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+
+def _is_video(head: bytes, suffix: str) -> bool:
+    """Matroska, AVI, MP4 or Y4M by the first bytes; what else FFmpeg reads by the name."""
+    avi = head[:4] == b"RIFF" and head[8:12] == b"AVI "
+    known = head.startswith((b"\x1a\x45\xdf\xa3", b"YUV4MPEG2")) or head[4:8] == b"ftyp"
+    return avi or known or suffix in VIDEO_SUFFIXES
 
 
 def open_stack(path: Path, dataset: str | None = None) -> AbstractContextManager[Stack]:
@@ -357,12 +393,13 @@ def open_stack(path: Path, dataset: str | None = None) -> AbstractContextManager
     if not path.is_file():
         raise ImageFileError("this is not a file; name image files, or a folder of them")
     with path.open("rb") as file:
-        head = file.read(8)
+        head = file.read(12)
     if not head:
         raise ImageFileError("the file is empty; copy or record it again")
     suffix = path.suffix.lower()
-    if head == _HDF5_MAGIC or suffix in STACK_SUFFIXES:
-        if head != _HDF5_MAGIC:
+    is_hdf5 = head.startswith(_HDF5_MAGIC)
+    if is_hdf5 or suffix in STACK_SUFFIXES:
+        if not is_hdf5:
             raise ImageFileError(f"the content is not HDF5, as {suffix} promises; check the file")
         return _open_hdf5(path, dataset)
     if dataset is not None:
@@ -370,7 +407,9 @@ def open_stack(path: Path, dataset: str | None = None) -> AbstractContextManager
     for magic, opener in _MAGIC:
         if head.startswith(magic):
             return opener(path)
-    known = ", ".join(s[1:] for s in (*IMAGE_SUFFIXES, *STACK_SUFFIXES))
+    if _is_video(head, suffix):
+        return _open_video(path)
+    known = ", ".join(s[1:] for s in (*IMAGE_SUFFIXES, *STACK_SUFFIXES, *VIDEO_SUFFIXES))
     if suffix in IMAGE_SUFFIXES:
         raise ImageFileError(
             f"the content is not that of a {suffix} image, nor of any other format read here; "

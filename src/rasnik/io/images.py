@@ -9,15 +9,22 @@ from __future__ import annotations
 import glob
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rasnik.io.formats import IMAGE_SUFFIXES, ImageFileError, open_stack
+from rasnik.io.formats import (
+    IMAGE_SUFFIXES,
+    VIDEO_SUFFIXES,
+    EndOfStack,
+    ImageFileError,
+    open_stack,
+)
 from rasnik.io.lwdaq import lwdaq_bounds
 
 __all__ = ["Frame", "Source", "count_frames", "expand_paths", "iter_frames"]
@@ -113,10 +120,13 @@ def _expand(name: str) -> list[Source]:
         except OSError as error:
             reason = error.strerror or str(error)
             return [Source(name, path, error=f"the folder cannot be read: {reason}")]
-        files = [p for p in entries if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file()]
-        suffixes = ", ".join(suffix[1:] for suffix in IMAGE_SUFFIXES)
+        for suffixes in (IMAGE_SUFFIXES, VIDEO_SUFFIXES):
+            files = [p for p in entries if p.suffix.lower() in suffixes and p.is_file()]
+            if files:
+                break
+        known = ", ".join(suffix[1:] for suffix in IMAGE_SUFFIXES + VIDEO_SUFFIXES)
         return [Source(str(p), p) for p in files] or [
-            Source(name, path, error=f"the folder holds no images ({suffixes}); name another")
+            Source(name, path, error=f"the folder holds no images ({known}); name another")
         ]
     if not path.exists() and glob.has_magic(file_name):
         matches = sorted(Path(match) for match in glob.glob(file_name, recursive=True))
@@ -131,10 +141,10 @@ def _expand(name: str) -> list[Source]:
 def expand_paths(paths: Iterable[PathLike]) -> list[Source]:
     """Files behind names of files, folders and patterns.
 
-    Folders give the images in them (not those in folders below), sorted naturally; HDF5 files
-    are left out there, since they hold results as often as images. Patterns (``*``, ``?``,
-    ``[]``, ``**``) are expanded here if the shell has not done it. A folder without images and
-    a pattern without matches give one `Source` with an `error`.
+    Folders give the images in them (not those in folders below), sorted naturally, or if there
+    are none the videos; HDF5 files are left out, since they hold results as often as images.
+    Patterns (``*``, ``?``, ``[]``, ``**``) are expanded here if the shell has not done it. A
+    folder without images and a pattern without matches give one `Source` with an `error`.
     """
     return [source for path in paths for source in _expand(os.fspath(path))]
 
@@ -196,36 +206,47 @@ def _error_frame(source: Source, index: int, error: Exception | str) -> Frame:
     return Frame(source.name, index, error=_sentence(name, str(error)))
 
 
-def _frames_of(source: Source) -> Iterator[Frame]:
+def _frames_of(source: Source, start: int) -> Generator[Frame, None, int]:
+    """Frames from number `start` on; returns how many of those before `start` it does not have."""
     # Decoders raise nearly anything on damaged files, hence the broad excepts.
     if source.error is not None:
-        yield _error_frame(source, 0, source.error)
-        return
+        if start == 0:
+            yield _error_frame(source, 0, source.error)
+        return max(0, start - 1)
     try:
         with open_stack(source.path, source.dataset) as stack:
-            for index in range(stack.count):
+            total, fault = stack.count, stack.error
+            for index in range(start, total) if stack.counted else count(start):
                 try:
                     frame = _frame(source, index, *stack.read(index))
+                except EndOfStack as end:
+                    total, fault = end.count, end.error
+                    break
                 except Exception as error:
                     frame = _error_frame(source, index, error)
                 yield frame
-            if stack.error is not None:
-                yield _error_frame(source, stack.count, stack.error)
+            if fault is not None and start <= total:
+                yield _error_frame(source, total, fault)
+            return max(0, start - total - (fault is not None))
     except Exception as error:
-        yield _error_frame(source, 0, error)
+        if start == 0:
+            yield _error_frame(source, 0, error)
+        return max(0, start - 1)
 
 
-def iter_frames(paths: Iterable[PathLike | Source]) -> Iterator[Frame]:
+def iter_frames(paths: Iterable[PathLike | Source], start: int = 0) -> Iterator[Frame]:
     """Every frame of the files, folders and patterns named.
 
-    Reads PNG, TIFF (with pages), GIF, BMP, PGM, PPM, JPEG, NPY and HDF5 (two- or
-    three-dimensional; ``file.h5:/dataset`` where there are several). Colour becomes Rec. 601
-    luminance, which is noted. Nothing is kept in memory but the current frame, except a
-    PGM file's bytes.
+    Reads PNG, TIFF (with pages), GIF, BMP, PGM, PPM, JPEG, NPY, HDF5 (two- or
+    three-dimensional; ``file.h5:/dataset`` where there are several) and video. Colour becomes
+    Rec. 601 luminance, which is noted. Nothing is kept in memory but the current frame, except
+    a PGM file's bytes.
 
     Parameters
     ----------
     paths : iterable of path-like or Source
+    start : int
+        Number of frames to leave out at the beginning; they are not read.
 
     Yields
     ------
@@ -235,11 +256,14 @@ def iter_frames(paths: Iterable[PathLike | Source]) -> Iterator[Frame]:
     """
     for path in paths:
         for source in [path] if isinstance(path, Source) else _expand(os.fspath(path)):
-            yield from _frames_of(source)
+            start = yield from _frames_of(source, start)
 
 
 def count_frames(source: Source) -> int:
-    """Number of frames `iter_frames` will give for a source; only headers are read."""
+    """Number of frames `iter_frames` will give for a source; only headers are read.
+
+    Of a video it is the number that its header promises, or an estimate from its duration.
+    """
     if source.error is not None:
         return 1
     try:
