@@ -277,9 +277,8 @@ def plot(results: list[Result], path: Path) -> None:
         panel.set_visible(False)
     for panel in panels[:, 0]:
         panel.set_ylabel("error of x and y,\nrms, pm / sqrt(Hz)")
-    for panel in panels[-1]:
+    for panel in (*panels[-1], *panels.flat[len(amplitudes) - columns : len(amplitudes)]):
         panel.set_xlabel("frequency, Hz")
-    for panel in panels[-2:, -1]:
         panel.xaxis.set_tick_params(labelbottom=True)
     axes = panels[0, 0]
     axes.plot([], [], color="black", lw=1.2, label="bound")
