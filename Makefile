@@ -29,6 +29,11 @@ $(BIN)/python:
 	$(PIP) install --editable '.[dev]'
 	@touch $@ .venv/.package
 
+# Packages to compare with; where they do not install, the benchmarks go without them and say so.
+.venv/.bench: .venv/.dev
+	$(PIP) install --editable '.[bench]' || echo "not installed: the packages to compare with"
+	@touch $@
+
 demo: .venv/.package
 	$(BIN)/rasnik demo $(ARGS)
 
@@ -44,7 +49,7 @@ format: .venv/.dev
 	$(BIN)/ruff check --fix $(SOURCES)
 	$(BIN)/ruff format $(SOURCES)
 
-bench: .venv/.dev
+bench: .venv/.dev .venv/.bench
 	@set -e; for file in $(sort $(wildcard benchmarks/[!_]*.py)); do echo "== $$file"; $(BIN)/python "$$file" $(ARGS); done
 
 # What is shipped must work without the checkout: systems and type marker included.
