@@ -31,8 +31,7 @@ $(BIN)/python:
 
 # Packages to compare with; where they do not install, the benchmarks go without them and say so.
 .venv/.bench: .venv/.dev
-	$(PIP) install --editable '.[bench]' || echo "not installed: the packages to compare with"
-	@touch $@
+	$(PIP) install --editable '.[bench]' && touch $@ || echo "the packages to compare with do not install"
 
 demo: .venv/.package
 	$(BIN)/rasnik demo $(ARGS)

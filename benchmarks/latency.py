@@ -29,7 +29,7 @@ from typing import Any  # noqa: E402
 
 import numpy as np  # noqa: E402
 
-from rasnik import Pose, Tracker, load_system  # noqa: E402
+from rasnik import Flag, Pose, Tracker, load_system  # noqa: E402
 from rasnik.imaging.projection import Projection  # noqa: E402
 
 START_UM = (41000.0, 30200.0)
@@ -54,9 +54,14 @@ def wait_until(moment_s: float) -> None:
 
 
 def paced(
-    work: Callable[[int], object], first: int, count: int, rate_hz: float, buffers: int
+    work: Callable[[int], Pose | None],
+    keep: Callable[[int, Pose | None], None],
+    ticks: range,
+    rate_hz: float,
+    buffers: int,
 ) -> np.ndarray:
     """Seconds from each tick to the end of its work; NaN for ticks whose frame was lost."""
+    count = len(ticks)
     latency = np.full(count, np.nan)
     start = time.perf_counter() + 0.01
     k = 0
@@ -67,8 +72,9 @@ def paced(
             k += behind - buffers + 1
             continue
         wait_until(tick)
-        work(first + k)
+        result = work(ticks[k])
         latency[k] = time.perf_counter() - tick
+        keep(ticks[k], result)
         k += 1
     return latency
 
@@ -89,7 +95,8 @@ class Stream:
         ]
         self.frames = _study.frame_pool(self.system, projections, seed=options.seed)
         self.tracker = Tracker(self.system, orientation=ORIENTATION)
-        self.poses: list[tuple[int, Pose]] = []
+        # Numbers, not poses: ten thousands of objects would occupy Python's memory management.
+        self.found: dict[int, tuple[float, ...]] = {}
 
     def index(self, k: int) -> int:
         """Which frame is shown at tick k: forth and back, without a jump."""
@@ -103,23 +110,27 @@ class Stream:
     def add_up(self, k: int) -> None:
         self.frames[self.index(k)].sum()
 
-    def follow(self, k: int) -> None:
-        pose = self.tracker.update(self.frames[self.index(k)], k / self.rate_hz, k)
-        self.poses.append((k, pose))
+    def follow(self, k: int) -> Pose:
+        return self.tracker.update(self.frames[self.index(k)], k / self.rate_hz, k)
+
+    def keep(self, k: int, pose: Pose | None) -> None:
+        if pose is not None:
+            sigmas = (pose.sigma_x_um, pose.sigma_y_um)
+            self.found[k] = (pose.x_um, pose.y_um, *sigmas, float(pose.ok), float(pose.flags))
 
     def judged(self) -> dict[str, Any]:
         """What became of the frames: errors against the truth, and flags."""
-        good = [(k, pose) for k, pose in self.poses if pose.ok]
-        found = np.array([[pose.x_um, pose.y_um] for _, pose in good])
-        sigma = np.array([[pose.sigma_x_um, pose.sigma_y_um] for _, pose in good])
-        error = found - self.truth_um[[self.index(k) for k, _ in good]]
+        table = np.array(list(self.found.values()))
+        ok = table[:, 4] > 0
+        truth = self.truth_um[[self.index(k) for k in self.found]]
+        error, sigma = (table[:, :2] - truth)[ok], table[ok, 2:4]
         flags: dict[str, int] = {}
-        for _, pose in self.poses:
-            for name in pose.flags.names:
-                flags[name] = flags.get(name, 0) + 1
+        for value, count in zip(*np.unique(table[:, 5], return_counts=True), strict=True):
+            for name in Flag(int(value)).names:
+                flags[name] = flags.get(name, 0) + int(count)
         return {
-            "frames": len(self.poses),
-            "without_position": len(self.poses) - len(good),
+            "frames": len(table),
+            "without_position": int(np.count_nonzero(~ok)),
             "wrong": int((np.abs(error) > WRONG_SIGMAS * sigma).any(axis=1).sum()),
             "error_rms_nm": 1e3 * float(np.sqrt(np.mean(error**2))),
             "sigma_rms_nm": 1e3 * float(np.sqrt(np.mean(sigma**2))),
@@ -141,11 +152,12 @@ def run(stream: Stream, options: argparse.Namespace) -> dict[str, np.ndarray]:
     done = round(options.warm_up * stream.rate_hz)
     for k in range(done):
         stream.follow(k)
-    stream.poses.clear()
     for first in range(done, done + total, part):
         for name, (work, share) in loops.items():
             count = max(1, round(min(part, done + total - first) * share))
-            found[name].append(paced(work, first, count, stream.rate_hz, options.buffers))
+            ticks = range(first, first + count)
+            latency = paced(work, stream.keep, ticks, stream.rate_hz, options.buffers)
+            found[name].append(latency)
             time.sleep(0.1)  # whatever still runs in the background ends
     return {name: np.concatenate(values) for name, values in found.items()}
 
