@@ -1,7 +1,7 @@
 """Tracks in and out of files, in the format the suffix names.
 
 ============ ===============================================================================
-``.h5``      HDF5 (see `rasnik.io.track_file`), the format tracks are measured into
+``.h5``      HDF5 (see `rasnik.io.track_table`), the format tracks are measured into
 ``.csv``     one header line with the names of the columns, one line for each frame
 ``.parquet`` Parquet; needs ``pip install "rasnik[parquet]"``
 ============ ===============================================================================
@@ -21,14 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rasnik.instrument import System
-from rasnik.io.track_file import (
-    HDF5_SUFFIXES,
-    ROW,
-    TrackWriter,
-    from_rows,
-    read_track_file,
-    track_metadata,
-)
+from rasnik.io.track_file import HDF5_SUFFIXES, TrackWriter, track_metadata
+from rasnik.io.track_table import ROW, from_rows, read_table
 from rasnik.tracking.track import TRACK_COLUMNS, Track
 
 if TYPE_CHECKING:
@@ -78,7 +72,7 @@ def read_track(
     path = Path(path)
     suffix = _known_suffix(path)
     if suffix in HDF5_SUFFIXES:
-        return read_track_file(path, start, stop)
+        return read_table(path, start, stop)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file")
     if suffix == ".csv":
@@ -136,16 +130,19 @@ def write_track(
     metadata = track_metadata(system, {"start_time_utc": "", **track.metadata})
     unfinished = path.with_name(f"{path.stem}.partial{path.suffix}")
     unfinished.unlink(missing_ok=True)
-    if suffix in HDF5_SUFFIXES:
-        with TrackWriter(unfinished, metadata=metadata) as writer:
-            writer.write(track)
-    elif suffix == ".csv":
-        _write_csv(track, unfinished)
-    else:
-        from rasnik.io.parquet import write_columns
+    try:
+        if suffix in HDF5_SUFFIXES:
+            with TrackWriter(unfinished, metadata=metadata) as writer:
+                writer.write(track)
+        elif suffix == ".csv":
+            _write_csv(track, unfinished)
+        else:
+            from rasnik.io.parquet import write_columns
 
-        write_columns(unfinished, TRACK_COLUMNS, track.as_dict(), metadata)
-    unfinished.replace(path)
+            write_columns(unfinished, TRACK_COLUMNS, track.as_dict(), metadata)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
 
 
 def _known_suffix(path: Path) -> str:

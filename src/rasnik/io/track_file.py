@@ -1,17 +1,4 @@
-"""Tracks in HDF5: one table that grows while others read it (SWMR).
-
-``/track``
-    Compound table with one row for each frame; the columns are those of
-    `rasnik.tracking.track.TRACK_COLUMNS`. A row is written as a whole, so columns never differ in
-    length. Numbers of frames increase from row to row. Attributes: ``format`` and
-    ``format_version``; ``columns``, ``units``, ``descriptions``; ``flag_masks`` and
-    ``flag_meanings`` for the integer column ``flags``; ``conventions``, ``software`` and
-    ``system_toml``; ``start_time_utc``; where known ``source`` and ``frame_rate_hz``; further
-    texts as given.
-
-The rows are not compressed: a part of a chunk that is written again in compressed form takes a
-new place in the file, and a file flushed every second would hold most rows many times.
-"""
+"""Measuring a track into a file: rows on their way to the disk within a second."""
 
 from __future__ import annotations
 
@@ -20,56 +7,30 @@ import math
 import os
 import threading
 import time
-import tomllib
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
-from rasnik._config import parse_overrides
 from rasnik.instrument import System
 from rasnik.io.file_lock import FileLock
-from rasnik.io.hdf5 import append_rows, describe_table
-from rasnik.io.hdf5_repair import clear_write_marks
+from rasnik.io.hdf5 import append_rows
 from rasnik.io.results import file_metadata
-from rasnik.tracking.track import TRACK_COLUMNS, Track
+from rasnik.io.track_table import MOST_ROWS, ROW, TABLE, TABLE_ATTRIBUTES, create_table, reopened
+from rasnik.tracking.track import Track
 
-__all__ = [
-    "HDF5_SUFFIXES",
-    "ROW",
-    "TrackWriter",
-    "from_rows",
-    "read_track_file",
-    "track_metadata",
-]
+__all__ = ["HDF5_SUFFIXES", "TrackWriter", "track_metadata"]
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
-
-_FORMAT = "rasnik track"
-_VERSION = 1
-_TABLE = "track"
-#: One row, as it is stored.
-ROW = np.dtype([(column.name, column.dtype) for column in TRACK_COLUMNS])
-_CHUNK_ROWS = 1024
-#: No more rows than these wait in memory; `TrackWriter.write` itself stores them then.
-_MOST_PENDING = 65_536
-#: The format of HDF5 1.10, the first with SWMR: the widest choice of readers.
-_LIBVER = "v110"
-#: Attributes that describe the table and not what was measured.
-_TABLE_ATTRIBUTES = {
-    "format", "format_version", "columns", "units", "descriptions", "flag_masks", "flag_meanings",
-}  # fmt: skip
 
 
 def track_metadata(system: System | None, metadata: Mapping[str, str] | None) -> dict[str, str]:
     """What is stored beside a track: what is known by itself, and what is given."""
-    taken = _TABLE_ATTRIBUTES & set(metadata or {})
+    taken = TABLE_ATTRIBUTES & set(metadata or {})
     if taken:
         raise ValueError(f"metadata cannot be named {', '.join(sorted(taken))}; use other names")
     known = {**file_metadata(system), **(metadata or {})}
@@ -79,9 +40,9 @@ def track_metadata(system: System | None, metadata: Mapping[str, str] | None) ->
 
 
 class TrackWriter:
-    """Writes a track into an HDF5 file while it is measured; see the module for its layout.
+    """Writes a track into an HDF5 file while it is measured.
 
-    A context manager. Others can read the file at any time, with `rasnik.io.read_track`. What
+    A context manager. The layout is told in `rasnik.io.track_table`. Others can read the file at any time, with `rasnik.io.read_track`. What
     is written is in the file, for the case that this program is killed, within `flush_s`,
     whether or not more follows.
 
@@ -99,7 +60,7 @@ class TrackWriter:
         Continue a file of the same system and source, also one whose writer was killed. Without
         such a file a new one is begun.
     flush_s : float
-        Longest time between `write` and the file. With 0 every write waits for the disk.
+        Longest time between `write` and the file. With 0 every `write` waits for it.
 
     Raises
     ------
@@ -142,10 +103,10 @@ class TrackWriter:
         self._wait_s = flush_s / 2
         if not self.path.exists():
             about.setdefault("start_time_utc", datetime.now(UTC).isoformat(timespec="milliseconds"))
-            _create(self.path, about)
+            create_table(self.path, about)
         self._lock = FileLock(self.path)
         try:
-            self._file, self._rows, self._next_frame = _reopened(self.path, about)
+            self._file, self._rows, self._next_frame = reopened(self.path, about)
         except BaseException:
             self._lock.release()
             raise
@@ -205,7 +166,7 @@ class TrackWriter:
             self._pending_rows += len(rows)
             self._rows += len(rows)
             self._next_frame = int(track.frame[-1]) + 1
-            if self._wait_s == 0 or self._pending_rows >= _MOST_PENDING:
+            if self._wait_s == 0 or self._pending_rows >= MOST_ROWS:
                 self._store()
                 self._raise_error()
             else:
@@ -251,8 +212,8 @@ class TrackWriter:
             return
         try:
             rows = np.concatenate(self._pending)
-            for first in range(0, len(rows), _MOST_PENDING):
-                append_rows(self._file[_TABLE], rows[first : first + _MOST_PENDING])
+            for first in range(0, len(rows), MOST_ROWS):
+                append_rows(self._file[TABLE], rows[first : first + MOST_ROWS])
         except Exception as error:
             self._error = error
         self._pending.clear()
@@ -284,153 +245,3 @@ class TrackWriter:
                     return True
                 self._changed.wait(left if self._pending else None)
             return False
-
-
-# ------------------------------------------------------------------------ making and continuing
-
-
-def _create(path: Path, metadata: Mapping[str, str]) -> None:
-    """A file without rows. It gets its name once it is complete: a kill leaves no half of it."""
-    unfinished = path.with_name(path.name + ".new")
-    with h5py.File(unfinished, "w", libver=_LIBVER, locking=False) as file:
-        table = file.create_dataset(
-            _TABLE,
-            shape=(0,),
-            maxshape=(None,),
-            dtype=ROW,
-            chunks=(_CHUNK_ROWS,),
-            fillvalue=np.array((-1, *(0,) * (len(TRACK_COLUMNS) - 1)), dtype=ROW),
-        )
-        attributes = {"format": _FORMAT, "format_version": _VERSION, **metadata}
-        describe_table(table, TRACK_COLUMNS, attributes)
-    unfinished.replace(path)
-
-
-def _reopened(path: Path, metadata: Mapping[str, str]) -> tuple[h5py.File, int, int]:
-    """(file in SWMR mode, rows, next frame) of a file to append to, repaired if need be."""
-    _check_same(path, read_track_file(path, stop=0).metadata, metadata)
-    was_killed = clear_write_marks(path)
-    file = h5py.File(path, "r+", libver=_LIBVER, locking=False)
-    try:
-        table = file[_TABLE]
-        if table.dtype != ROW:
-            raise ValueError(
-                f"{path}: the columns are those of another version of this program; "
-                "begin a new file"
-            )
-        rows = len(table)
-        if was_killed:
-            # More rows than are ever stored at a time.
-            first = max(0, rows - 4 * _MOST_PENDING)
-            rows = first + _whole_rows(table.fields("frame")[first:])
-            table.resize((rows,))
-        next_frame = int(table[rows - 1]["frame"]) + 1 if rows else 0
-        file.swmr_mode = True
-    except BaseException:
-        file.close()
-        raise
-    return file, rows, next_frame
-
-
-def _whole_rows(frame: NDArray[np.int64]) -> int:
-    """Number of rows before the first that was announced but, after a kill, never written.
-
-    In such rows the number of the frame is -1 or 0, so it does not increase.
-    """
-    bad = np.flatnonzero(np.diff(frame, prepend=-1) <= 0)
-    return int(bad[0]) if len(bad) else len(frame)
-
-
-def _check_same(path: Path, stored: Mapping[str, str], given: Mapping[str, str]) -> None:
-    """Refuse to continue a track of another system or source.
-
-    Raises
-    ------
-    ValueError
-    """
-    differences = _system_differences(stored.get("system_toml", ""), given.get("system_toml", ""))
-    if stored.get("source", "") != given.get("source", ""):
-        differences.append(_difference("source", stored.get("source"), given.get("source")))
-    if differences:
-        raise ValueError(
-            f"{path} cannot be continued, it was made with another system or source: "
-            f"{'; '.join(differences)}. Give another name, or what it was made with"
-        )
-
-
-def _difference(name: str, stored: object, given: object) -> str:
-    texts = ["nothing" if value in (None, "") else repr(value) for value in (stored, given)]
-    return f"{name} is {texts[0]} in the file, {texts[1]} now"
-
-
-def _system_differences(stored: str, given: str) -> list[str]:
-    """What differs between two systems in TOML, one sentence for each field."""
-    if not stored or not given:
-        before, now = (
-            tomllib.loads(text).get("name") if text else None for text in (stored, given)
-        )
-        return [] if stored == given else [_difference("system", before, now)]
-    fields: list[dict[str, Any]] = []
-    for text in (stored, given):
-        content = tomllib.loads(text)
-        try:  # fields that an earlier version did not know get their defaults
-            content = System.model_validate(content).model_dump(exclude_none=True)
-        except ValidationError:
-            pass
-        fields.append(parse_overrides("", content))
-    old, new = fields
-    return [
-        _difference(name, old.get(name), new.get(name))
-        for name in {**old, **new}
-        if name != "description" and old.get(name) != new.get(name)
-    ]
-
-
-# ------------------------------------------------------------------------ reading
-
-
-def read_track_file(path: Path, start: int | None = None, stop: int | None = None) -> Track:
-    """The rows of a file by `TrackWriter`, also one that is being written; see `read_track`."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: there is no such file")
-    with _opened(path) as file:
-        table = file.get(_TABLE)
-        if not isinstance(table, h5py.Dataset) or table.attrs.get("format") != _FORMAT:
-            raise ValueError(f"{path}: the HDF5 file holds no track")
-        if table.attrs["format_version"] > _VERSION:
-            raise ValueError(
-                f"{path}: the track was written by a later version "
-                f"({table.attrs.get('software')}); update rasnik to read it"
-            )
-        metadata = {
-            key: str(value)
-            for key, value in table.attrs.items()
-            if key not in _TABLE_ATTRIBUTES and str(value)
-        }
-        try:
-            rows = table[slice(*slice(start, stop).indices(len(table)))]
-        except OSError as error:
-            raise OSError(f"{path}: the file is damaged or incomplete ({error})") from error
-    rows = rows[: _whole_rows(rows["frame"])]
-    return from_rows(rows, metadata)
-
-
-def from_rows(rows: NDArray[Any], metadata: Mapping[str, str] | None = None) -> Track:
-    """A track from a structured array of type `ROW`."""
-    columns: dict[str, Any] = {column.name: rows[column.name] for column in TRACK_COLUMNS}
-    return Track(**columns, metadata=metadata or {})
-
-
-def _opened(path: Path) -> h5py.File:
-    """An HDF5 file for reading; a writer may be about to open or close it at this moment."""
-    attempts = 10
-    for attempt in range(attempts):
-        try:
-            return h5py.File(path, "r", swmr=True, locking=False)
-        except OSError as error:
-            if not h5py.is_hdf5(path):
-                raise ValueError(f"{path}: this is not an HDF5 file") from error
-            if attempt == attempts - 1 or "open for" not in str(error):
-                raise OSError(f"{path}: the HDF5 file cannot be opened ({error})") from error
-        time.sleep(0.1)
-    raise AssertionError("not reached")
