@@ -5,7 +5,8 @@ SolidRas, 720 x 540 pixels of 8 bits, a disturbance of 1 to 10 frames about ever
 
 right       within 6 of its own sigmas of the truth, or within 5 nm anywhere in the image.
             If parts of a frame show different poses, one of them, or one in between if they
-            are less than 0.1 um apart (as when the mask moves during an exposure).
+            are less than 0.1 um apart (as when the mask moves during an exposure), whole fields
+            not counted.
 none        no position was given.
 wrong       anything else, by the strongest flag that came with it:
   unflagged   none at all
@@ -68,14 +69,18 @@ def strength(flags: int) -> str:
     return "treated" if not flags & ~int(_INFORMED | _TREATED) else "warned"
 
 
+def _length(error: np.ndarray) -> float:
+    return float(np.hypot(*error[:2]))
+
+
 @dataclass
 class Report:
     """Counts of a fault run.
 
     Attributes
     ----------
-    height_um : float
-        Of the image.
+    height_um, field_um : float
+        Of the image and of a field.
     outcomes : dict of Counter
         By kind of frame, by outcome (`OUTCOMES`).
     flags : dict of Counter
@@ -97,6 +102,7 @@ class Report:
     """
 
     height_um: float
+    field_um: float
     outcomes: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     flags: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     relock: dict[str, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
@@ -136,7 +142,7 @@ class Report:
             self.outcomes[truth.kind][outcome] += 1
             self.flags[truth.kind].update(Flag(flags).names)
             if outcome not in ("right", "none"):
-                near = found[j] - truth.poses[0] if len(truth.poses) else np.full(4, np.nan)
+                near = min(found[j] - truth.poses, key=_length, default=np.full(4, np.nan))
                 self.wrong.append({
                     "index": first + j, "kind": truth.kind, "outcome": outcome,
                     "error": near.tolist(), "sigma": sigma[j].tolist(),
@@ -161,17 +167,33 @@ class Report:
         if (error <= allowed).all(axis=1).any():
             self.short_sigma += pull > 6
             return "right", pull
-        low, high = truth.poses.min(axis=0), truth.poses.max(axis=0)
-        apart = float(np.hypot(*(high - low)[:2]))
-        # A straight line through a step has at most 1.5 steps over its length as its slope.
-        allowed[2:] += 1.5 * apart / self.height_um
-        inside = ((found >= low - allowed) & (found <= high + allowed)).all()
-        if truth.view is View.PIECES and inside and apart < _SMEAR_UM:
-            if not flags:
-                distance = float(np.hypot(*error[:, :2].T).min())
-                self.between = max(self.between, distance)
-            return "right", pull
+        if truth.view is View.PIECES:
+            distance = self._smeared(found, allowed, truth.poses)
+            if distance is not None:
+                self.between = max(self.between, 0.0 if flags else distance)
+                return "right", pull
         return strength(flags), pull
+
+    def _smeared(self, found: np.ndarray, allowed: np.ndarray, poses: np.ndarray) -> float | None:
+        """Distance (um) to the nearest piece of a result between two that nearly agree.
+
+        Pieces whole fields apart share the chessboard: which of them it is, the code says.
+        None if the result is none of this.
+        """
+        distances = []
+        for one in poses:
+            for other in poses:
+                apart = other - one
+                apart[:2] -= self.field_um * np.rint(apart[:2] / self.field_um)
+                smear = float(np.hypot(*apart[:2]))
+                # A straight line through a step has at most 1.5 steps over its length as slope.
+                margin = allowed + np.array([0, 0, 1, 1]) * 1.5 * smear / self.height_um
+                error = found - one
+                inside = error >= np.minimum(apart, 0) - margin
+                inside &= error <= np.maximum(apart, 0) + margin
+                if smear < _SMEAR_UM and inside.all():
+                    distances.append(float(np.hypot(*error[:2])))
+        return min(distances, default=None)
 
     def _follow(self, k: int, truth: Truth, ok: bool, pull: float, flags: int) -> None:
         """Count frames until the position is right again, and losses where nothing happens."""
@@ -218,7 +240,9 @@ def follow(
     stream: FaultStream, tracker: Tracker, size: int = 256, progress: Any = None
 ) -> tuple[Report, Track]:
     """Track a stream and judge every frame; also the last piece of the track."""
-    report, done, block = Report(stream.system.shape[0] * stream.system.pitch_um), 0, Track()
+    system = stream.system
+    report = Report(system.shape[0] * system.pitch_um, system.mask.field_um)
+    done, block = 0, Track()
     blocks: Iterable[Track] = tracker.blocks(
         stream.frames(), stream.times_s.tolist(), stream.numbers.tolist(), size
     )

@@ -102,7 +102,7 @@ def one_row(error_sigma: float, flags: Flag = Flag.NONE, ok: bool = True) -> Tra
 
 
 def judged(track: Track, truth: Truth) -> Report:
-    report = Report(height_um=3700.0)
+    report = Report(height_um=3700.0, field_um=85.0)
     report.add(0, track, [truth])
     return report
 
@@ -136,7 +136,8 @@ def test_any_position_is_wrong_where_nothing_is_seen() -> None:
 
 
 def test_between_the_pieces_is_right_only_for_a_smear() -> None:
-    for apart_um, outcome in ((0.05, "right"), (0.5, "unflagged")):
+    # a code that neither piece has is wrong, whatever the chessboard says
+    for apart_um, outcome in ((0.05, "right"), (0.5, "unflagged"), (2 * 85.0, "unflagged")):
         poses = np.stack([POSE, POSE])
         poses[0, 0] -= apart_um / 2
         poses[1, 0] += apart_um / 2
@@ -148,7 +149,7 @@ def test_between_the_pieces_is_right_only_for_a_smear() -> None:
 
 @pytest.mark.parametrize(("late", "passed"), [(0, True), (1, True), (2, False)])
 def test_relocking_is_counted(late: int, passed: bool) -> None:
-    report = Report(height_um=3700.0)
+    report = Report(height_um=3700.0, field_um=85.0)
     blank = Truth("dark", View.NOTHING, np.empty((0, 4)))
     lost = one_row(0.0, Flag.NO_MASK, ok=False)
     tracks = [one_row(0.0), lost, *[lost] * late, one_row(0.0), one_row(0.0)]
