@@ -205,7 +205,8 @@ def _settled_by_prior(decoding: Decoding, prior: Pose | None, field_um: float) -
     ]
     if len(near) != 1:
         return decoding
-    return replace(decoding, best=near[0], flags=decoding.flags & ~Flag.AMBIGUOUS)
+    flags = (decoding.flags & ~Flag.AMBIGUOUS) | Flag.SETTLED_BY_PRIOR
+    return replace(decoding, best=near[0], flags=flags)
 
 
 # --------------------------------------------------------------------- from a prior

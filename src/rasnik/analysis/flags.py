@@ -41,6 +41,7 @@ class Flag(IntFlag):
     OBSTRUCTED = 1 << 23
     FRAMES_LOST = 1 << 24
     TIME_IRREGULAR = 1 << 25
+    SETTLED_BY_PRIOR = 1 << 26
 
     @property
     def names(self) -> list[str]:
@@ -221,5 +222,11 @@ FLAGS: tuple[FlagInfo, ...] = (
         False,
         "The time of this frame does not follow that of the frame before.",
         "Check the camera's clock.",
+    ),
+    FlagInfo(
+        Flag.SETTLED_BY_PRIOR,
+        False,
+        "Several positions explain the image; the one near the prior pose was taken.",
+        "Show more of the mask if the mask may have moved by several fields.",
     ),
 )

@@ -35,6 +35,8 @@ __all__ = [
     "Moments",
     "all_tiles",
     "gather",
+    "symmetric_index",
+    "tile_monomials",
 ]
 
 MASK_X, MASK_Y, DARK, LIGHT, BLUR_VARIANCE, EDGE_SHIFT, KURTOSIS = range(7)
@@ -90,24 +92,37 @@ def all_tiles(shape: tuple[int, int]) -> NDArray[np.int32]:
     return np.ascontiguousarray(tiles.reshape(-1, 2), dtype=np.int32)
 
 
+def tile_monomials(camera: Camera, tiles: NDArray[np.int32], parts: int = 1) -> NDArray[np.float64]:
+    """Monomials at the centres of tiles, shape (n, 6).
+
+    Parameters
+    ----------
+    tiles : ndarray of int32, shape (n, 2)
+        (row, column) of the tiles.
+    parts : int, optional
+        How many times wider than high a tile is.
+    """
+    size = np.array([kernels.TILE, parts * kernels.TILE])
+    ends = np.minimum(tiles * size + size, camera.shape)
+    centre = (tiles * size + ends - 1) / 2
+    (u0, v0), (hu, hv) = camera.origin_um, camera.half_size_um
+    return surface(
+        (u0 + centre[:, 1] * camera.pixel_um) / hu, (v0 + centre[:, 0] * camera.pixel_um) / hv
+    )
+
+
 @lru_cache(maxsize=8)
 def _monomials(
     camera: Camera, tile_bytes: bytes
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Monomials at the centres of tiles, shape (n, 6), and their 21 products, shape (n, 21)."""
     tiles = np.frombuffer(tile_bytes, dtype=np.int32).reshape(-1, 2)
-    height, width = camera.shape
-    ends = np.minimum(tiles * kernels.TILE + kernels.TILE, [height, width])
-    centre = (tiles * kernels.TILE + ends - 1) / 2
-    (u0, v0), (hu, hv) = camera.origin_um, camera.half_size_um
-    u = (u0 + centre[:, 1] * camera.pixel_um) / hu
-    v = (v0 + centre[:, 0] * camera.pixel_um) / hv
-    basis = surface(u, v)
+    basis = tile_monomials(camera, tiles)
     first, second = np.triu_indices(N_MONOMIALS)
     return basis, basis[:, first] * basis[:, second]
 
 
-def _symmetric_index(size: int) -> NDArray[np.intp]:
+def symmetric_index(size: int) -> NDArray[np.intp]:
     """Position of element (a, b) in the packed upper triangle, shape (size * size,)."""
     index = np.zeros((size, size), dtype=np.intp)
     upper = np.triu_indices(size)
@@ -115,11 +130,11 @@ def _symmetric_index(size: int) -> NDArray[np.intp]:
     return index.ravel()
 
 
-_PRODUCT = _symmetric_index(kernels.N_SIGNALS).reshape(kernels.N_SIGNALS, kernels.N_SIGNALS)
+_PRODUCT = symmetric_index(kernels.N_SIGNALS).reshape(kernels.N_SIGNALS, kernels.N_SIGNALS)
 _SIGNAL_PAIRS = _PRODUCT[:_N, :_N][np.triu_indices(_N)]
 _RESIDUAL_PAIRS = _PRODUCT[:_N, kernels.RESIDUAL]
 _CHI2 = _PRODUCT[kernels.RESIDUAL, kernels.RESIDUAL]
-_EXPAND = np.ix_(_symmetric_index(_N), _symmetric_index(N_MONOMIALS))
+_EXPAND = np.ix_(symmetric_index(_N), symmetric_index(N_MONOMIALS))
 
 
 def gather(

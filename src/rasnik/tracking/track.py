@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rasnik.analysis.flags import FLAGS, Flag
 from rasnik.analysis.pose import Pose
 
-__all__ = ["TRACK_COLUMNS", "Track", "TrackColumn"]
+__all__ = ["POSE_COLUMNS", "TRACK_COLUMNS", "Track", "TrackColumn"]
 
 _FATAL = sum(info.flag for info in FLAGS if info.fatal)
 
@@ -48,7 +48,8 @@ TRACK_COLUMNS: tuple[TrackColumn, ...] = (
 )
 
 _TYPES = {column.name: np.dtype(column.dtype) for column in TRACK_COLUMNS}
-_POSE_COLUMNS = tuple(
+#: Those that are attributes of a pose.
+POSE_COLUMNS = tuple(
     column.name for column in TRACK_COLUMNS if column.name not in ("frame", "time_s", "flags")
 )
 
@@ -148,7 +149,7 @@ class Track:
         poses = list(poses)
         rows: dict[str, Any] = {
             name: np.array([getattr(pose, name) for pose in poses], dtype=float)
-            for name in _POSE_COLUMNS
+            for name in POSE_COLUMNS
         }
         return cls(
             frame=np.array(list(frame) if frame is not None else range(len(poses)), dtype=np.int64),

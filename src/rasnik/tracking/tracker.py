@@ -1,23 +1,55 @@
-"""Following a mask from frame to frame."""
+"""Following a mask from frame to frame, at camera rate and at the bound.
+
+Most frames lie near a reference and take one pass over their pixels (`Reference.read`). A
+frame that the reference does not explain is looked at again, with more and more effort: with a
+new reference where the mask seems to have gone, with a full fit from the last pose, from
+nothing. Every frame's flags say what was done and why; no position is reported that did
+not explain its frame, code included.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from itertools import islice
+from itertools import count, islice
 from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
 from rasnik.analysis.analyse import analyse
 from rasnik.analysis.flags import Flag
-from rasnik.analysis.frame import Bounds, resolve_instrument
-from rasnik.analysis.parameters import Model
+from rasnik.analysis.frame import Bounds, prepare_frame, resolve_instrument
+from rasnik.analysis.parameters import POSE_SIZE, Model, State
 from rasnik.analysis.pose import Pose
 from rasnik.instrument import System
-from rasnik.tracking.track import Track
+from rasnik.tracking.linearisation import Builder
+from rasnik.tracking.motion import Motion
+from rasnik.tracking.reference import (
+    CONVERGENT,
+    LIGHT_USABLE,
+    NEAR,
+    USABLE,
+    Reading,
+    Reference,
+    build,
+    model_of,
+    vector_of,
+)
+from rasnik.tracking.track import POSE_COLUMNS, TRACK_COLUMNS, Track
 
 __all__ = ["Tracker"]
+
+Image = NDArray[Any]
+
+_SLICES = 24  # frames over which a new reference is made in a stream
+_ATTEMPTS = 3  # references tried on one frame that moved
+_PATIENCE = 3  # frames with something in the way before that is taken as lasting
+_MORE_MASKED = 5e-4
+_PERIODS = 32  # frames over which the period is averaged
+_MOST_AT_ONCE = 64  # frames
+_AS_STORED = ("uint8", "uint16", "float32")
 
 
 class Tracker:
@@ -31,6 +63,15 @@ class Tracker:
         Where to begin, from an earlier track of the same mask.
     threads : int, optional
         Number of frames worked on at a time by `run` and `blocks`.
+
+    Examples
+    --------
+    >>> import rasnik
+    >>> poses = [(4000.0 + 0.01 * k, 5000.0, 0.002) for k in range(5)]
+    >>> frames = rasnik.simulate("solidras", poses, seed=1).frames
+    >>> track = rasnik.Tracker("solidras").run(frames)
+    >>> track.ok.all(), float((track.x_um[-1] - track.x_um[0]).round(2))
+    (np.True_, 0.04)
     """
 
     def __init__(
@@ -45,57 +86,423 @@ class Tracker:
         prior: Pose | None = None,
         threads: int = 1,
     ) -> None:
-        _, _, self.system = resolve_instrument(system, field_um, pixel_um)
+        if threads < 1:
+            raise ValueError(f"threads must be at least 1, not {threads!r}")
+        self._mask, self._pitch_um, self.system = resolve_instrument(system, field_um, pixel_um)
         self._options: dict[str, Any] = {
             "system": self.system, "field_um": field_um, "pixel_um": pixel_um,
             "model": model, "orientation": orientation, "bounds": bounds,
         }  # fmt: skip
-        self._last = prior
+        self._threads = threads
+        self._shape = None if self.system is None else self.system.shape
+        self._prior = prior
+        self._reference: Reference | None = None
+        self._last_reading: Reading | None = None
+        self._builder: Builder | None = None
+        self._motion = Motion()
+        self._odd = 0  # frames in a row that a fit explained less well
+        self._at_once = _MOST_AT_ONCE
+        self._clock = 0.0  # frames since the beginning, lost ones included
+        self._number, self._time_s = -1, float("nan")  # of the last frame
+        self._period_s: float | None = None
+        #: Number of references made so far.
+        self.references = 0
+
+    # ----------------------------------------------------------------- what callers use
 
     def update(
-        self, frame: NDArray[Any] | None, t: float | None = None, number: int | None = None
+        self, frame: Image | None, t: float | None = None, number: int | None = None
     ) -> Pose:
-        """The pose in the next frame."""
-        if frame is None:
-            return Pose(flags=Flag.NO_IMAGE)
-        pose = analyse(frame, prior=self._last, **self._options)
-        if pose.ok:
-            if self._last is None:
-                pose = replace(pose, flags=pose.flags | Flag.COLD_START)
-            self._last = pose
-        return pose
+        """The pose in the next frame of a stream.
+
+        New references are made a little with every frame, so that none of them waits.
+
+        Parameters
+        ----------
+        frame : ndarray, shape (H, W), or None
+            Grey levels; None for a frame that could not be read.
+        t : float, optional
+            Its time, in seconds.
+        number : int, optional
+            Its number; frames that were lost leave numbers out.
+
+        Returns
+        -------
+        Pose
+            With the flags of tracking: what was done and why.
+        """
+        arrival = self._take_note(t, number)
+        grey = self._usable_frame(frame)
+        if grey is None:
+            return Pose(flags=Flag.NO_IMAGE | arrival)
+        reference = self._reference
+        if reference is None:
+            return self._recover(grey, None, arrival)
+        reading = reference.read([grey])
+        if not reference.fits(reading)[0]:
+            return self._recover(grey, reading, arrival)
+        self._accept(reference, reading, [self._clock])
+        self._work_ahead(reference, reading)
+        return reference.pose(reading, arrival)
 
     def blocks(
         self,
-        frames: Iterable[NDArray[Any] | None],
+        frames: Iterable[Image | None],
         times: Iterable[float] | None = None,
         numbers: Iterable[int] | None = None,
         size: int = 256,
     ) -> Iterator[Track]:
-        """Track a stream of any length, piece by piece."""
-        frames = iter(frames)
-        times_, numbers_ = iter(times or ()), iter(numbers or ())
-        done = 0
-        while chunk := list(islice(frames, size)):
-            n = len(chunk)
-            number = (
-                list(islice(numbers_, n)) if numbers is not None else list(range(done, done + n))
-            )
-            time = list(islice(times_, n)) if times is not None else [float("nan")] * n
-            done += n
-            yield Track.from_poses(map(self.update, chunk, time, number), number, time)
+        """Track a sequence of any length, piece by piece, in bounded memory.
+
+        Parameters
+        ----------
+        frames : iterable of ndarray, shape (H, W), or None
+            Grey levels; None for frames that could not be read.
+        times : iterable of float, optional
+            Their times, in seconds. By default they follow from their numbers and the
+            system's frame rate, if it has one.
+        numbers : iterable of int, optional
+            Their numbers, 0, 1, 2, ... by default; frames that were lost leave numbers out.
+        size : int, optional
+            Frames in a piece.
+
+        Yields
+        ------
+        Track
+            The next `size` frames; the last piece may be shorter.
+        """
+        source = iter(frames)
+        ordinals: Iterator[int] = count() if numbers is None else iter(numbers)
+        clock: Iterator[float] | None = None if times is None else iter(times)
+        with ThreadPoolExecutor(self._threads) as pool:
+            mapping = map if self._threads == 1 else pool.map
+            while chunk := list(islice(source, size)):
+                number = np.fromiter(islice(ordinals, len(chunk)), dtype=np.int64)
+                if clock is not None:
+                    time = np.fromiter(islice(clock, len(chunk)), dtype=np.float64)
+                else:
+                    time = self._nominal_times(number)
+                if len(number) < len(chunk) or len(time) < len(chunk):
+                    raise ValueError("there are fewer times or numbers than frames")
+                yield self._track(chunk, time, number, mapping)
 
     def run(
         self,
-        frames: Iterable[NDArray[Any] | None],
+        frames: Iterable[Image | None],
         times: Iterable[float] | None = None,
         numbers: Iterable[int] | None = None,
         progress: Callable[[int], object] | None = None,
     ) -> Track:
-        """Track all frames."""
-        blocks = []
-        for block in self.blocks(frames, times, numbers):
-            blocks.append(block)
+        """Track all frames of a sequence.
+
+        Parameters
+        ----------
+        frames, times, numbers
+            As for `blocks`.
+        progress : callable, optional
+            Called with the number of frames done since the last call.
+        """
+        pieces = []
+        for piece in self.blocks(frames, times, numbers):
+            pieces.append(piece)
             if progress is not None:
-                progress(len(block))
-        return Track.concatenate(blocks)
+                progress(len(piece))
+        return Track.concatenate(pieces)
+
+    # ----------------------------------------------------------------- frames that fit
+
+    def _track(
+        self,
+        frames: list[Image | None],
+        time_s: NDArray[np.float64],
+        number: NDArray[np.int64],
+        mapping: Any,
+    ) -> Track:
+        """Track a list of frames, many at once as long as they fit."""
+        columns: dict[str, Any] = {c.name: np.full(len(frames), np.nan) for c in TRACK_COLUMNS}
+        columns.update(frame=number, time_s=time_s, flags=np.zeros(len(frames), dtype=np.uint32))
+        done = 0
+        while done < len(frames):
+            batch = self._batch(frames[done : done + self._at_once])
+            n = self._track_batch(batch, slice(done, done + len(batch)), columns, mapping)
+            if n == 0:  # the next frame needs more than one look
+                pose = self._look_closer(frames[done], time_s[done], number[done])
+                for name in POSE_COLUMNS:
+                    columns[name][done] = getattr(pose, name)
+                columns["flags"][done] = pose.flags
+                n = 1
+            whole = n == len(batch)
+            self._at_once = min(2 * self._at_once, _MOST_AT_ONCE) if whole else n
+            done += n
+        return Track(**columns)
+
+    def _batch(self, frames: list[Image | None]) -> list[Image]:
+        """The next frames, as far as they can be tracked at all."""
+        batch: list[Image] = []
+        for frame in frames:
+            grey = self._usable_frame(frame)
+            if grey is None or self._reference is None:
+                break
+            batch.append(grey)
+        return batch
+
+    def _track_batch(
+        self, batch: list[Image], rows: slice, columns: dict[str, Any], mapping: Any
+    ) -> int:
+        """Fill in the rows of the frames up to the first that does not fit; how many there are."""
+        reference = self._reference
+        if reference is None or not batch:
+            return 0
+        reading = reference.read(batch, mapping)
+        good, near = reference.fits(reading), reference.near(reading)
+        n = len(batch) if good.all() else int(np.argmin(good))
+        if not near[:n].all():  # that frame still counts; the next ones get a new reference
+            n = int(np.argmin(near[:n])) + 1
+        if n == 0:
+            return 0
+        rows = slice(rows.start, rows.start + n)
+        reading = reading[:n]
+        for name, values in reference.columns(reading).items():
+            columns[name][rows] = values
+        clock = []
+        arrivals = zip(columns["time_s"][rows], columns["frame"][rows], strict=True)
+        for k, (t, number) in enumerate(arrivals, rows.start):
+            columns["flags"][k] = int(reference.flags | self._take_note(t, number))
+            clock.append(self._clock)
+        self._accept(reference, reading, clock)
+        if not near[n - 1]:
+            self._follow(reference, reading[n - 1 :])
+        return n
+
+    def _accept(self, reference: Reference, reading: Reading, clock: list[float]) -> None:
+        """Learn from frames that fit."""
+        reference.learn(reading)
+        for time, step in zip(clock[-3:], reading.steps[-3:], strict=True):
+            self._motion.add(time, reference.vector + step[:4])
+        self._last_reading = reading[len(reading) - 1 :]
+        self._odd = 0
+
+    # ----------------------------------------------------------------- new references
+
+    def _follow(self, reference: Reference, reading: Reading) -> None:
+        """A new reference, a little ahead of where the mask is."""
+        velocity = self._motion.velocity
+        speed = float(np.hypot(*velocity[:2]))
+        frames = 0.0 if speed < 0.1 * reference.near_um else 0.8 * reference.near_um / speed
+        self._replace(reference, self._ahead(reference, reading, frames))
+
+    def _ahead(self, reference: Reference, reading: Reading, frames: float) -> State:
+        step = reading.steps[0].copy()
+        step[:4] += frames * self._motion.velocity
+        return reference.linear.stepped(step)
+
+    def _replace(self, reference: Reference, state: State) -> None:
+        try:
+            self._reference = reference.moved_to(build(reference.linear.settings, state))
+        except ValueError:  # a state that cannot be modelled; the next frame decides
+            return
+        self.references += 1
+
+    def _work_ahead(self, reference: Reference, reading: Reading) -> None:
+        """A part of the work on a new reference, in a stream that must not wait."""
+        builder = self._builder
+        if builder is None:
+            if not reference.near(reading)[0]:
+                try:
+                    state = self._ahead(reference, reading, _SLICES)
+                    self._builder = Builder(reference.linear.settings, state)
+                except ValueError:
+                    return
+        elif builder.advance(-(-builder.tiles // _SLICES)):
+            self._builder = None
+            here = reference.vector + reading.steps[0, :4]
+            there = vector_of(builder.state, reference.origin.orientation)
+            if _distance(here - there) < _distance(reading.steps[0, :4]):
+                self._reference = reference.moved_to(builder.finish())
+                self.references += 1
+
+    # ----------------------------------------------------------------- frames that do not fit
+
+    def _look_closer(self, frame: Image | None, t: float, number: int) -> Pose:
+        """The pose in a frame that did not fit, or for which there is no reference."""
+        arrival = self._take_note(t, number)
+        grey = self._usable_frame(frame)
+        if grey is None:
+            return Pose(flags=Flag.NO_IMAGE | arrival)
+        reference = self._reference
+        return self._recover(grey, None if reference is None else reference.read([grey]), arrival)
+
+    def _recover(self, grey: Image, reading: Reading | None, arrival: Flag) -> Pose:
+        """First a new reference where the mask seems to be, then a full fit."""
+        self._builder = None
+        reference = self._reference
+        if reference is None or reading is None:
+            return self._fit(grey, arrival, self._prior)
+        if not reference.usable(reading)[0]:
+            for step in self._guesses(reference, reading):
+                found = self._relocate(reference, grey, step)
+                if found is not None:
+                    self._reference, close = found
+                    self._accept(self._reference, close, [self._clock])
+                    flags = Flag.REFITTED | arrival | _changes(reference, reading)
+                    return self._reference.pose(close, flags)
+        return self._fit(grey, arrival, self._expected(reference))
+
+    def _guesses(self, reference: Reference, reading: Reading) -> Iterator[NDArray[np.float64]]:
+        """Steps to where the mask may be: as extrapolated, and as the reference has it."""
+        predicted = self._motion.predict(self._clock)
+        step = reading.steps[0]
+        plausible = bool(reference.motion(reading)[0] < CONVERGENT)
+        if predicted is not None and not plausible:
+            guess = np.zeros_like(step)
+            guess[:4] = predicted - reference.vector
+            if _distance(guess[:4]) > 2 * reference.near_um:
+                yield guess
+        if plausible:
+            yield step
+
+    def _relocate(
+        self, reference: Reference, grey: Image, step: NDArray[np.float64]
+    ) -> tuple[Reference, Reading] | None:
+        """A reference that explains the frame, begun from a step; None if there is none."""
+        linear = reference.linear
+        for _ in range(_ATTEMPTS):
+            try:
+                linear = build(linear.settings, linear.stepped(step))
+            except ValueError:
+                return None
+            self.references += 1
+            moved = reference.moved_to(linear)
+            reading = moved.read([grey])
+            if moved.usable(reading)[0]:
+                return (moved, reading) if moved.explains(reading)[0] else None
+            if not moved.motion(reading)[0] < CONVERGENT:
+                return None
+            step = reading.steps[0]
+        return None
+
+    def _expected(self, reference: Reference) -> Pose | None:
+        """The last pose that was tracked, moved to where the mask should be now."""
+        if self._last_reading is None:
+            return None
+        pose = reference.pose(self._last_reading)
+        predicted = self._motion.predict(self._clock)
+        if predicted is None or pose.projection is None or pose.appearance is None:
+            return pose
+        step = np.zeros(reference.linear.n_parameters)
+        step[:4] = predicted - reference.vector
+        state = reference.linear.stepped(step)
+        return replace(pose, projection=state.projection)
+
+    def _fit(self, grey: Image, arrival: Flag, prior: Pose | None) -> Pose:
+        """A full fit, from a pose nearby or from nothing."""
+        pose = analyse(grey, prior=prior, **self._options)
+        if pose.flags & Flag.SETTLED_BY_PRIOR:  # the mask may have moved by many fields
+            return Pose(flags=(pose.flags & ~Flag.SETTLED_BY_PRIOR) | Flag.AMBIGUOUS | arrival)
+        cold = prior is None or bool(pose.flags & Flag.PRIOR_REJECTED)
+        flags = (pose.flags & ~Flag.PRIOR_REJECTED) | arrival
+        if not pose.ok:
+            return replace(pose, flags=flags)
+        flags |= Flag.COLD_START if cold else Flag.REFITTED
+        reference = self._reference
+        if reference is not None:
+            flags |= _changes_of(reference, pose)
+            odd = _is_odd(reference, pose)
+            if odd:
+                flags |= Flag.OBSTRUCTED
+                self._odd += 1
+            if odd and self._odd <= _PATIENCE:
+                return replace(pose, flags=flags)
+        self._begin(grey, pose)
+        return replace(pose, flags=flags)
+
+    def _begin(self, grey: Image, pose: Pose) -> None:
+        """Track from a full fit on."""
+        frame, _ = prepare_frame(
+            grey, self._mask, self._pitch_um, self.system, self._options["bounds"]
+        )
+        free = self._options["model"] == "auto"
+        self._reference, self._last_reading = Reference.from_fit(frame, pose, free)
+        self.references += 1
+        self._odd = 0
+        self._motion.add(self._clock, self._reference.vector)
+
+    # ----------------------------------------------------------------- arrival
+
+    def _usable_frame(self, frame: Image | None) -> Image | None:
+        """The frame as the kernels take it; None if it is not an image of the right size."""
+        if frame is None:
+            return None
+        array = np.asarray(frame)
+        if self._shape is None and array.ndim == 2:
+            self._shape = array.shape
+        if array.shape != self._shape or array.dtype.kind not in "uif":
+            return None
+        if array.dtype.name not in _AS_STORED:
+            fits = array.dtype.kind in "iu" and array.min() >= 0 and array.max() < 2**16
+            array = array.astype(np.uint16 if fits else np.float32)
+        if array.dtype.kind == "f" and not np.isfinite(array.sum()):
+            array = np.nan_to_num(array, nan=0.0, posinf=0.0, neginf=0.0)
+        return np.ascontiguousarray(array)
+
+    def _take_note(self, t: float | None, number: int | None) -> Flag:
+        """Whether a frame's time and number follow those of the one before."""
+        flags = Flag.NONE
+        before, self._number = self._number, self._number + 1 if number is None else int(number)
+        passed = self._number - before
+        if before >= 0 and passed != 1:
+            flags |= Flag.FRAMES_LOST if passed > 1 else Flag.TIME_IRREGULAR
+        self._clock += max(passed, 1)
+        if t is None or not np.isfinite(t):
+            return flags
+        elapsed, self._time_s = t - self._time_s, float(t)
+        if not np.isfinite(elapsed):
+            return flags
+        if elapsed <= 0:
+            return flags | Flag.TIME_IRREGULAR
+        each = elapsed / max(passed, 1)
+        if self._period_s is None:
+            self._period_s = each
+        elif not 0.5 < each / self._period_s < 1.5:
+            flags |= Flag.TIME_IRREGULAR
+        self._period_s += (min(each, 2 * self._period_s) - self._period_s) / _PERIODS
+        return flags
+
+    def _nominal_times(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
+        rate = None if self.system is None else self.system.sensor.frame_rate_hz
+        return number / rate if rate else np.full(len(number), np.nan)
+
+
+def _distance(step: NDArray[np.float64]) -> float:
+    """Motion on the mask that a change of the pose makes, at the centre."""
+    return float(np.hypot(step[0], step[1]))
+
+
+def _changes(reference: Reference, reading: Reading) -> Flag:
+    """Why a frame was out of a reference's range."""
+    flags = Flag.LIGHT_CHANGED if reference.light_changed(reading)[0] else Flag.NONE
+    return flags | (Flag.MOVED if not reference.motion(reading)[0] < USABLE else Flag.NONE)
+
+
+def _changes_of(reference: Reference, pose: Pose) -> Flag:
+    """The same from a full fit."""
+    flags = Flag.NONE
+    x, y = reference.vector[:2]
+    if np.hypot(pose.x_um - x, pose.y_um - y) > USABLE / NEAR * reference.near_um:
+        flags |= Flag.MOVED
+    light = reference.linear.state.appearance
+    ratio = (pose.light_level - pose.dark_level) / (light.light[0] - light.dark[0])
+    if not abs(ratio - 1) < LIGHT_USABLE:
+        flags |= Flag.LIGHT_CHANGED
+    return flags
+
+
+def _is_odd(reference: Reference, pose: Pose) -> bool:
+    """Whether a fit needed more freedom, or left out or unexplained more, than those before."""
+    settings = reference.linear.settings
+    masked = 1 - reference.linear.n_pixels / settings.valid.size
+    return bool(
+        pose.masked_fraction > masked + _MORE_MASKED
+        or POSE_SIZE[model_of(pose)] > POSE_SIZE[settings.model]
+        or pose.chi2_ndf > 1.05 * max(1.0, reference.chi2_ratio)
+    )
