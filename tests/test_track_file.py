@@ -183,6 +183,12 @@ def test_tables_and_hdf5_files_without_a_track(tmp_path, make):
         file["track"] = np.zeros(3)
     with pytest.raises(ValueError, match="holds no track"):
         read_track(tmp_path / HDF5_FILE)
+    with h5py.File(tmp_path / HDF5_FILE, "r+") as file:
+        file["track"].attrs.update({"format": "rasnik track", "format_version": 1})
+    with pytest.raises(ValueError, match="columns of the track are missing: frame, time_s"):
+        read_track(tmp_path / HDF5_FILE)
+    with h5py.File(tmp_path / HDF5_FILE, "w") as file:
+        file["results"] = np.zeros(3)
     before = (tmp_path / HDF5_FILE).read_bytes()
     with pytest.raises(ValueError, match="holds no track"):
         TrackWriter(tmp_path / HDF5_FILE, resume=True)
@@ -583,7 +589,16 @@ def test_gwpy_missing_names_the_extra(make, monkeypatch):
         to_gwpy(make())
 
 
-# ------------------------------------------------------------------------ light
+# ------------------------------------------------------------------------ light, and described
+
+
+def test_every_column_is_described():
+    page = Path(__file__).resolve().parents[1] / "docs" / "track-files.md"
+    if not page.exists():
+        pytest.skip("the pages are not beside the tests")
+    lines = page.read_text(encoding="utf-8").splitlines()
+    for column in TRACK_COLUMNS:
+        assert f"| `{column.name}` | {column.unit} | {column.description} |" in lines
 
 
 def test_the_names_are_loaded_when_they_are_used():

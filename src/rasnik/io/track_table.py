@@ -201,6 +201,9 @@ def _content(
             f"{path}: the track was written by a later version "
             f"({table.attrs.get('software')}); update rasnik to read it"
         )
+    missing = [name for name in ROW.names or () if name not in (table.dtype.names or ())]
+    if missing:
+        raise ValueError(f"{path}: columns of the track are missing: {', '.join(missing)}")
     metadata = {
         key: str(value)
         for key, value in table.attrs.items()
