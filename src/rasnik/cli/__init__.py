@@ -10,10 +10,12 @@ from rasnik.cli.analyse import analyse_command
 from rasnik.cli.budget import budget_command
 from rasnik.cli.demo import demo_command
 from rasnik.cli.design import design_command
+from rasnik.cli.export import export_command
 from rasnik.cli.mask import mask_command
 from rasnik.cli.predict import predict_command
 from rasnik.cli.simulate import simulate_command
 from rasnik.cli.systems import systems_command
+from rasnik.cli.track import track_command
 
 __all__ = ["app"]
 
@@ -47,6 +49,8 @@ def _main(
 
 
 app.command("analyse")(analyse_command)
+app.command("track")(track_command)
+app.command("export")(export_command)
 app.command("simulate")(simulate_command)
 app.command("systems")(systems_command)
 app.command("demo")(demo_command)
