@@ -89,6 +89,8 @@ class Report:
         By kind of disturbance, by number of frames.
     never : dict of Counter
         Likewise, of those that the next disturbance put an end to.
+    late_at : list of int
+        Frames by which it should have been relocked.
     lost : list of int
         Undisturbed frames without a position.
     false_alarms : int
@@ -107,6 +109,7 @@ class Report:
     flags: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
     relock: dict[str, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
     never: dict[str, Counter[int]] = field(default_factory=lambda: defaultdict(Counter))
+    late_at: list[int] = field(default_factory=list)
     lost: list[int] = field(default_factory=list)
     false_alarms: int = 0
     short_sigma: int = 0
@@ -115,19 +118,13 @@ class Report:
     _waiting: str = ""
     _waited: int = 0
 
-    @property
-    def late(self) -> int:
-        """Disturbances after which more than `RELOCK` frames were needed."""
-        counts = [sum(c[k] for k in c if k > RELOCK) for c in self.relock.values()]
-        return sum(counts) + sum(sum(c[k] for k in c if k >= RELOCK) for c in self.never.values())
-
     def total(self, outcome: str) -> int:
         return sum(counts[outcome] for counts in self.outcomes.values())
 
     @property
     def passed(self) -> bool:
         silent = self.total("unflagged") + self.total("informed")
-        return not (silent or self.late or self.lost)
+        return not (silent or self.late_at or self.lost)
 
     def add(self, first: int, track: Track, truths: Sequence[Truth]) -> None:
         """Judge the frames of a piece of the track; `first` is the index of its first one."""
@@ -211,6 +208,8 @@ class Report:
             self._waiting, self._waited = "", 0
         else:
             self._waited += 1
+            if self._waited == RELOCK:
+                self.late_at.append(k)
 
     def _give_up(self) -> None:
         if self._waiting and self._waited:
@@ -222,7 +221,7 @@ class Report:
             "frames": sum(map(sum, (c.values() for c in self.outcomes.values()))),
             "passed": self.passed,
             **{name: self.total(name) for name in OUTCOMES},
-            "relocked_late": self.late,
+            "relocked_late": len(self.late_at),
             "lost_for_no_reason": len(self.lost),
             "flagged_for_no_reason": self.false_alarms,
             "right_but_sigma_short": self.short_sigma,
@@ -231,6 +230,7 @@ class Report:
             "relock": self.relock,
             "disturbed_again_before_relock": self.never,
             "flags": self.flags,
+            "late_at": self.late_at[:1000],
             "lost": self.lost[:1000],
             "wrong": self.wrong[:1000],
         }
@@ -293,7 +293,8 @@ def _print(report: Report) -> None:
         )
     print(
         f"\nwrong and unflagged {report.total('unflagged')}, with information only "
-        f"{report.total('informed')}; relocked later than frame {RELOCK}: {report.late}; "
+        f"{report.total('informed')}; relocked later than frame {RELOCK}: "
+        f"{len(report.late_at)} {report.late_at[:10]}; "
         f"undisturbed, but without position: {len(report.lost)} {report.lost[:10]}\n"
         f"undisturbed, but flagged: {report.false_alarms}; right within 5 nm, not within "
         f"6 sigma: {report.short_sigma}; torn frames between their pieces, unflagged: off by up "
