@@ -95,6 +95,7 @@ class Stream:
         ]
         self.frames = _study.frame_pool(self.system, projections, seed=options.seed)
         self.tracker = Tracker(self.system, orientation=ORIENTATION)
+        self.references_before = 0
         # Numbers, not poses: ten thousands of objects would occupy Python's memory management.
         self.found: dict[int, tuple[float, ...]] = {}
 
@@ -135,6 +136,7 @@ class Stream:
             "error_rms_nm": 1e3 * float(np.sqrt(np.mean(error**2))),
             "sigma_rms_nm": 1e3 * float(np.sqrt(np.mean(sigma**2))),
             "flags": flags,
+            "references": self.tracker.references - self.references_before,
         }
 
 
@@ -152,6 +154,7 @@ def run(stream: Stream, options: argparse.Namespace) -> dict[str, np.ndarray]:
     done = round(options.warm_up * stream.rate_hz)
     for k in range(done):
         stream.follow(k)
+    stream.references_before = stream.tracker.references
     for first in range(done, done + total, part):
         for name, (work, share) in loops.items():
             count = max(1, round(min(part, done + total - first) * share))
@@ -191,7 +194,8 @@ def show(results: dict[str, dict[str, float]], judged: dict[str, Any]) -> None:
     print(
         f"\nposes: {judged['frames']}, without position {judged['without_position']}, "
         f"wrong {judged['wrong']}; rms error {judged['error_rms_nm']:.3f} nm, "
-        f"stated {judged['sigma_rms_nm']:.3f} nm\nflags: {flags}"
+        f"stated {judged['sigma_rms_nm']:.3f} nm\n"
+        f"new references {judged['references']}; flags: {flags}"
     )
 
 

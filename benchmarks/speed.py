@@ -249,6 +249,23 @@ def show(title: str, repeats: int, rows: list[Row]) -> None:
         )
 
 
+def markdown(rows: list[Row]) -> str:
+    """The rows as a table for the documentation."""
+    lines = ["| | | ms | frames/s | ns/pixel | / sum | / rfft2 | error, px |", "|---" * 8 + "|"]
+    for r in rows:
+        error = "" if r.error_px is None else f"{r.error_px:.2g}"
+        lines.append(
+            f"| {r.case} | {r.task} | {_short(r.ms_median)} | {_short(r.frames_per_s)} "
+            f"| {_short(r.ns_per_pixel)} | {_short(r.per_sum)} | {_short(r.per_rfft2)} | {error} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _short(value: float) -> str:
+    """Three figures, without an exponent."""
+    return f"{value:.3g}" if value < 999.5 else f"{float(f'{value:.3g}'):.0f}"
+
+
 # ------------------------------------------------------------------------- peers
 
 
@@ -342,17 +359,22 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("-n", type=int, default=15, help="repetitions")
+    parser.add_argument("-n", type=int, default=11, help="repetitions")
     parser.add_argument("--frames", type=int, default=128, help="frames in memory for each case")
     parser.add_argument("--displacements", type=int, default=16, help="for the errors of the peers")
     parser.add_argument("--only", nargs="+", choices=TABLES, default=list(TABLES))
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", metavar="FILE", help="write all rows")
+    parser.add_argument("--markdown", metavar="FILE", help="write the tables, medians only")
     options = parser.parse_args()
     print(_study.environment())
     print(f"seed {options.seed}")
-    rows = [row for name in options.only for row in TABLES[name](options)]
-    _study.save_json(options.json, options=vars(options), rows=[row._asdict() for row in rows])
+    tables = {name: TABLES[name](options) for name in options.only}
+    rows = [row._asdict() | {"table": name} for name in tables for row in tables[name]]
+    _study.save_json(options.json, options=vars(options), rows=rows)
+    if options.markdown:
+        with open(options.markdown, "w", encoding="utf-8") as file:
+            file.write("\n".join(f"{name}\n\n{markdown(some)}" for name, some in tables.items()))
 
 
 if __name__ == "__main__":
