@@ -235,8 +235,11 @@ def _from_prior(
         or result.explained < _PRIOR_EXPLAINED
     ):
         return None
+    pose = _pose(frame, result, prior.orientation, flags)
+    if not pose.ok:
+        return None
     return replace(
-        _pose(frame, result, prior.orientation, flags),
+        pose,
         polarity=prior.polarity,
         code_lines_read=prior.code_lines_read,
         code_lines_in_view=prior.code_lines_in_view,

@@ -236,8 +236,9 @@ def _apply(matrix, sums, result):
 def _amplitudes(t, step, n_pose, lever, basis, contrast, units, curvature, amplitude, excess):
     """How much of each signal a step puts into a tile, and how much of that is not linear.
 
-    A contrast that differs from the reference scales the motion; the motion enters with a
-    cubic term; and its square looks like blur. Returns the motion (fields) and the contrast.
+    A contrast or a blur that differs from the reference scales the motion; the motion enters
+    with a cubic term; and its square looks like blur. Returns the motion (fields) and the
+    contrast.
     """
     dx = 0.0
     dy = 0.0
@@ -252,13 +253,19 @@ def _amplitudes(t, step, n_pose, lever, basis, contrast, units, curvature, ampli
     ratio = 1.0 + (light - dark) / contrast[t]
     xx = dx * dx
     yy = dy * dy
-    amplitude[MASK_X] = ratio * dx * (1.0 + curvature[0, 0] * xx + curvature[0, 1] * yy)
-    amplitude[MASK_Y] = ratio * dy * (1.0 + curvature[1, 0] * xx + curvature[1, 1] * yy)
+    shape = n_pose + 2 * _N_MONOMIALS - BLUR_VARIANCE
+    bx = xx + step[shape + BLUR_VARIANCE] / (2.0 * curvature[2, 0])
+    by = yy + step[shape + BLUR_VARIANCE] / (2.0 * curvature[2, 1])
+    amplitude[MASK_X] = (
+        ratio * dx * (1.0 + curvature[0, 0] * (3.0 * bx - 2.0 * xx) + curvature[0, 1] * by)
+    )
+    amplitude[MASK_Y] = (
+        ratio * dy * (1.0 + curvature[1, 0] * bx + curvature[1, 1] * (3.0 * by - 2.0 * yy))
+    )
     amplitude[DARK] = dark
     amplitude[LIGHT] = light
     excess[MASK_X] = amplitude[MASK_X] - dx
     excess[MASK_Y] = amplitude[MASK_Y] - dy
-    shape = n_pose + 2 * _N_MONOMIALS - BLUR_VARIANCE
     for s in range(BLUR_VARIANCE, amplitude.size):
         linear = units[s - BLUR_VARIANCE] * step[shape + s]
         amplitude[s] = ratio * linear

@@ -215,8 +215,9 @@ class Builder:
 
             c = (1/6) sum(w E1 E3) / sum(w E1^2),    k = -(1/2) sum(g1^2) / sum(g^2),
 
-        and g = 2 E - 1 stands for the edges along Y, over one field. Half of the squared
-        motions along X and Y, averaged, is what blurs an edge as much.
+        and g = 2 E - 1 stands for the edges along Y, over one field. A blur variance b (fields^2)
+        adds 3 c b + k b likewise; conversely, half of the squared motions along X and Y,
+        averaged, is what blurs an edge as much.
         """
         scene, (a, b, floor) = self._scene, self._noise
         dark, light = scene.photometry[:, 0]

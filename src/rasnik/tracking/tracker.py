@@ -406,13 +406,14 @@ class Tracker:
         flags |= Flag.COLD_START if cold else Flag.REFITTED
         reference = self._reference
         if reference is not None:
-            flags |= _changes_of(reference, pose)
-            odd = _is_odd(reference, pose)
-            if odd:
+            changes = _changes_of(reference, pose)
+            flags |= changes
+            if not changes or _is_odd(reference, pose):  # a frame near the reference would fit it
                 flags |= Flag.OBSTRUCTED
+            if flags & Flag.OBSTRUCTED:
                 self._odd += 1
-            if odd and self._odd <= _PATIENCE:
-                return replace(pose, flags=flags)
+                if self._odd <= _PATIENCE:
+                    return replace(pose, flags=flags)
         self._begin(grey, pose)
         return replace(pose, flags=flags)
 
