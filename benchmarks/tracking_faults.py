@@ -17,7 +17,7 @@ wrong       anything else, by the strongest flag that came with it:
 
 Relocking: the number of undisturbed frames after a disturbance, the first right one (ok, within
 5 sigma) included. Only the first two kinds of wrong results, relocking later than the second
-frame, and undisturbed frames without position count as failures.
+frame, and undisturbed frames without the right position count as failures.
 
     python benchmarks/tracking_faults.py -n 100000 --json faults.json
 """
@@ -92,9 +92,9 @@ class Report:
     late_at : list of int
         Frames by which it should have been relocked.
     lost : list of int
-        Undisturbed frames without a position.
+        Undisturbed frames without the right position.
     false_alarms : int
-        Undisturbed frames with a position and a flag.
+        Undisturbed frames with the right position and a flag.
     short_sigma : int
         Right within 5 nm, but not within 6 sigma.
     between : float
@@ -145,7 +145,7 @@ class Report:
                     "error": near.tolist(), "sigma": sigma[j].tolist(),
                     "flags": Flag(flags).names,
                 })  # fmt: skip
-            self._follow(first + j, truth, bool(ok), pull, flags)
+            self._follow(first + j, truth, outcome, pull, flags)
 
     def _judged(
         self,
@@ -192,7 +192,7 @@ class Report:
                     distances.append(float(np.hypot(*error[:2])))
         return min(distances, default=None)
 
-    def _follow(self, k: int, truth: Truth, ok: bool, pull: float, flags: int) -> None:
+    def _follow(self, k: int, truth: Truth, outcome: str, pull: float, flags: int) -> None:
         """Count frames until the position is right again, and losses where nothing happens."""
         if truth.view is not View.FULL or truth.change:
             self._give_up()
@@ -200,9 +200,9 @@ class Report:
         if truth.view is not View.FULL:
             return
         if not self._waiting:
-            if not ok:
+            if outcome != "right":
                 self.lost.append(k)
-            self.false_alarms += ok and flags != 0
+            self.false_alarms += outcome == "right" and flags != 0
         elif pull < 5:
             self.relock[self._waiting][self._waited + 1] += 1
             self._waiting, self._waited = "", 0
@@ -259,6 +259,24 @@ def follow(
     return report, block
 
 
+def _print_wrong(wrong: list[dict[str, Any]], most: int = 40) -> None:
+    """The first of every run of wrong frames that are alike."""
+    before, lines = None, 0
+    for row in wrong:
+        here = (row["kind"], row["outcome"], row["index"])
+        is_next = before == (*here[:2], row["index"] - 1)
+        before = here
+        if is_next or lines == most:
+            continue
+        lines += 1
+        x, y = (1e3 * value for value in row["error"][:2])
+        print(
+            f"  {row['outcome']:>9}, frame {row['index']}, {row['kind']}: off by {x:.4g}, "
+            f"{y:.4g} nm, sigma {1e3 * row['sigma'][0]:.2g} nm, "
+            f"{', '.join(row['flags']) or 'no flag'}"
+        )
+
+
 def _print(report: Report) -> None:
     order = [k for k in ("quiet", "dust", *KINDS) if k in report.outcomes]
     width = 22
@@ -284,18 +302,12 @@ def _print(report: Report) -> None:
         common = report.flags[kind].most_common(6)
         print(f"{kind:{width}}" + ", ".join(f"{name} {c / n:.2f}" for name, c in common))
 
-    for wrong in report.wrong[:40]:
-        x, y = (1e3 * value for value in wrong["error"][:2])
-        print(
-            f"  {wrong['outcome']:>9}, frame {wrong['index']}, {wrong['kind']}: off by "
-            f"{x:.4g}, {y:.4g} nm, sigma {1e3 * wrong['sigma'][0]:.2g} nm, "
-            f"{', '.join(wrong['flags']) or 'no flag'}"
-        )
+    _print_wrong(report.wrong)
     print(
         f"\nwrong and unflagged {report.total('unflagged')}, with information only "
         f"{report.total('informed')}; relocked later than frame {RELOCK}: "
         f"{len(report.late_at)} {report.late_at[:10]}; "
-        f"undisturbed, but without position: {len(report.lost)} {report.lost[:10]}\n"
+        f"undisturbed, but without the right position: {len(report.lost)} {report.lost[:10]}\n"
         f"undisturbed, but flagged: {report.false_alarms}; right within 5 nm, not within "
         f"6 sigma: {report.short_sigma}; torn frames between their pieces, unflagged: off by up "
         f"to {1e3 * report.between:.1f} nm\n{'passed' if report.passed else 'FAILED'}"

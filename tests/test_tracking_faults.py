@@ -126,7 +126,10 @@ QUIET = Truth("quiet", View.FULL, POSE[None])
 def test_results_are_judged(track: Track, outcome: str) -> None:
     report = judged(track, QUIET)
     assert report.total(outcome) == 1
-    assert report.passed == (outcome in ("right", "treated", "warned"))
+    assert report.passed == (outcome == "right")
+    # where something is in the way, a warning will do
+    hidden = judged(track, replace(QUIET, kind="hand", view=View.PART))
+    assert hidden.passed == (outcome not in ("unflagged", "informed"))
 
 
 def test_any_position_is_wrong_where_nothing_is_seen() -> None:
@@ -145,6 +148,13 @@ def test_between_the_pieces_is_right_only_for_a_smear() -> None:
         # but one of the pieces always is
         near = np.stack([POSE, POSE + [apart_um, 0, 0, 0]])
         assert judged(one_row(1.0), Truth("torn", View.PIECES, near)).total("right") == 1
+
+
+def test_flags_excuse_nothing_where_nothing_is_wrong() -> None:
+    report = Report(height_um=3700.0, field_um=85.0)
+    tracks = [one_row(0.0), one_row(0.0), one_row(20.0, Flag.OBSTRUCTED)]
+    report.add(0, Track.concatenate(tracks), [replace(QUIET, change="start"), QUIET, QUIET])
+    assert report.lost == [2] and not report.passed
 
 
 @pytest.mark.parametrize(("late", "passed"), [(0, True), (1, True), (2, False)])
