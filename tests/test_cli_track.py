@@ -305,6 +305,16 @@ def test_another_sequence_is_not_appended(tmp_path, images):
     assert len(read_track(path)) == COUNT
 
 
+def test_a_track_that_is_being_written_is_left_alone(tmp_path, images):
+    source, path = write_hdf5(tmp_path / "s.h5", images[:2]), tmp_path / "track.h5"
+    rasnik("track", source, *INSTRUMENT, "-o", path)
+    with TrackWriter(path, system=SYSTEM, metadata={"source": str(source)}, resume=True):
+        assert "another program" in refused("track", source, *INSTRUMENT, "-o", path)
+        message = refused("track", source, *INSTRUMENT, "-o", path, "--overwrite")
+        assert "another program" in message
+    assert len(read_track(path)) == 2
+
+
 # ------------------------------------------------------------------------ refusals
 
 

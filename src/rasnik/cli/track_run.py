@@ -22,6 +22,7 @@ from rich.markup import escape
 from rasnik.cli.common import fail, messages
 from rasnik.cli.track_summary import Summary
 from rasnik.cli.track_terminal import Interrupts, progress
+from rasnik.io.file_lock import FileLock
 from rasnik.io.images import Frame, Source, expand_paths, iter_frames
 from rasnik.io.read_ahead import read_ahead
 
@@ -85,8 +86,15 @@ def run_track(frames: list[str], options: Options) -> int:
         fail(f"there are no images: {'; '.join(f'{s.name}: {s.error}' for s in sources)}.")
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # faults come out as errors
     run = _Run(options)
-    begun_s = time.monotonic()
-    interrupted = False
+    try:
+        interrupted = _track_all(run, frames, sources, options)
+    except OSError as error:  # of the file of the track; those of frames are rows
+        fail(f"{str(error).rstrip('.')}.")
+    return _finish(run, options, interrupted)
+
+
+def _track_all(run: _Run, frames: list[str], sources: list[Source], options: Options) -> bool:
+    """Track all frames, or until Ctrl-C; returns whether it was that."""
     with ExitStack() as opened:
         stop = opened.enter_context(Interrupts())
         try:
@@ -97,16 +105,12 @@ def run_track(frames: list[str], options: Options) -> int:
             if head:
                 if first:
                     messages().print(escape(f"{options.file} is continued at frame {first}"))
-                begun_s = time.monotonic()
                 bounds = next((f.bounds_px for f in head if f.image is not None), None)
                 advance = opened.enter_context(progress(sources, first))
                 run.track(chain(head, stream), bounds, first, stop, advance)
         except KeyboardInterrupt:
-            interrupted = True
-        except OSError as error:
-            fail(f"{error}.")
-    return _finish(run, options, first=run.first, seconds=time.monotonic() - begun_s,
-                   interrupted=interrupted)  # fmt: skip
+            return True
+    return False
 
 
 # ------------------------------------------------------------------------ before the first frame
@@ -166,6 +170,8 @@ class _Run:
         self.first = 0
         self.done = 0
         """Frames of this run."""
+        self.frames_per_s = math.nan
+        """Without the first block, in which the mask is found and compiled code is loaded."""
         self.blocks: list[Track] = []
         """Kept for the plot if there is no file to read them from again."""
         self._writer: TrackWriter | None = None
@@ -177,8 +183,10 @@ class _Run:
         options, self.first = self._options, first
         if options.file is None:
             return
-        if not options.resume:
-            options.file.unlink(missing_ok=True)
+        if not options.resume and options.file.exists():
+            lock = FileLock(options.file)  # not while another program writes it
+            options.file.unlink()
+            lock.release()
         try:
             self._writer = opened.enter_context(
                 TrackWriter(
@@ -219,6 +227,7 @@ class _Run:
         )
         number, size = first, 1
         last_s = time.monotonic()
+        begun: tuple[int, float] | None = None
         while chunk := list(islice(frames, size)):
             numbers = range(number, number + len(chunk))
             images, reasons = _images(chunk, numbers, options.system)
@@ -235,6 +244,10 @@ class _Run:
             now_s = time.monotonic()
             size = _next_size(len(chunk), now_s - last_s, images)
             last_s = now_s
+            if begun is None:
+                begun = self.done, now_s
+            else:
+                self.frames_per_s = (self.done - begun[0]) / max(now_s - begun[1], 1e-9)
 
 
 def _images(
@@ -315,18 +328,18 @@ def _named(block: Track, chunk: list[Frame], reasons: dict[int, str]) -> dict[in
 # ------------------------------------------------------------------------ the end
 
 
-def _finish(run: _Run, options: Options, *, first: int, seconds: float, interrupted: bool) -> int:
+def _finish(run: _Run, options: Options, interrupted: bool) -> int:
     """Show what came out; returns the exit status."""
     console, path = messages(), options.file
     nothing_new = not run.done and not interrupted
-    rate = run.done / seconds if run.done and seconds > 0 else math.nan
+    rate = run.frames_per_s
     if options.plot is not None and not interrupted:
         _plot(run, options)
     if options.json:
         about = {
             **run.summary.as_dict(),
             "frames_per_s": rate if math.isfinite(rate) else None,
-            "continued_at": first or None,
+            "continued_at": run.first or None,
             "interrupted": interrupted,
             "file": None if path is None else str(path),
         }

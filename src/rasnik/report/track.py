@@ -20,7 +20,7 @@ _DPI = 110
 _COLOUR = "#2f6fb3"
 #: Columns into which a long track is gathered; more than the plot has pixels across.
 _COLUMNS = 2000
-#: Up to here every frame is a point of its own.
+#: Up to here every frame, or what befell it, has a point of its own.
 _FEW = 120
 
 _FAILED = "no position"
@@ -231,8 +231,8 @@ def _draw_events(
         column = np.floor((places - along[0]) / span * _COLUMNS)
         places = places[np.concatenate([[True], np.diff(column) > 0])]
         axes.plot(
-            places, np.full(len(places), -row), marker, color=colour, markersize=5,
-            linestyle="none", fillstyle="full",
+            places, np.full(len(places), -row), marker if len(places) <= _FEW else "|",
+            color=colour, markersize=5, linestyle="none", fillstyle="full",
         )  # fmt: skip
     names = [f"{name} ({int(frames.sum()):,})" for name, frames, *_ in events]
     axes.set_yticks([-row for row in range(len(events))], names, fontsize=8)
