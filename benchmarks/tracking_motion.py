@@ -43,7 +43,7 @@ from rasnik.imaging.noise import add_noise  # noqa: E402
 from rasnik.imaging.poses import parse_pose  # noqa: E402
 from rasnik.imaging.simulate import PATHS, simulate  # noqa: E402
 from rasnik.performance.bound import camera_of, state_at  # noqa: E402
-from tracking_accuracy import RATIO_LIMIT, Metered, shown, values, verdict  # noqa: E402
+from tracking_accuracy import RATIO_LIMIT, Metered, shown, values, verdict, warm_up  # noqa: E402
 
 SYSTEM = load_system("solidras")
 RATE_HZ = 275.0
@@ -368,6 +368,7 @@ def main() -> None:
     frequencies = options.hz or (FULL_FREQUENCIES_HZ if options.full else FREQUENCIES_HZ)
     least = options.n or (2048 if options.full else 384)
     print(_study.environment(), f"seed {options.seed}", sep="\n")
+    warm_up()
     # Half a period at least, which is the way from end to end.
     cases = [
         Case(amplitude, hz, max(least, math.ceil(RATE_HZ / hz / (1 if options.full else 2))))

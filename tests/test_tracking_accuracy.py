@@ -82,12 +82,24 @@ def test_agrees_with_the_full_fit_of_the_same_frames(still) -> None:
     assert (rms_pm <= 10).all(), rms_pm
 
 
-def test_no_step_along_a_walk_without_noise() -> None:
+@pytest.fixture(scope="module")
+def walk() -> tuple[NDArray[np.float64], list[Any]]:
+    """Poses along a random walk of some 2 um, and their frames without noise and rounding."""
     rng = np.random.default_rng(5)
     steps = rng.standard_normal((26, 3)) * [0.04, 0.04, 2e-7] + [0.06, -0.04, 0.0]
-    poses = POSE + np.cumsum(steps, axis=0)  # some 2 um
-    walk = simulate(SOLIDRAS, poses, seed=1, noise=False)
-    track = Tracker(SOLIDRAS).run(frame.astype(np.float32) for frame, _ in walk)
+    poses = POSE + np.cumsum(steps, axis=0)
+    simulation = simulate(SOLIDRAS, poses, seed=1, noise=False)
+    return poses, [frame.astype(np.float32) for frame, _ in simulation]
+
+
+@pytest.mark.parametrize("way", ["run", "update"])
+def test_no_step_along_a_walk_without_noise(way: str, walk) -> None:
+    poses, frames = walk
+    tracker = Tracker(SOLIDRAS)
+    if way == "run":
+        track = tracker.run(frames)
+    else:
+        track = Track.from_poses(map(tracker.update, frames))
     errors_pm = 1e6 * (values(track)[:, :2] - poses[:, :2])
     assert np.abs(np.diff(errors_pm, axis=0)).max() < 20
     assert np.abs(errors_pm).max() < 20
