@@ -184,7 +184,7 @@ def test_nothing_wrong_goes_without_a_flag() -> None:
 
 def test_memory_does_not_grow(tmp_path: Path) -> None:
     path = tmp_path / "track.h5"
-    n = 4000
+    n = 2560
     table, ok = measure(n, 16, path, every=np.inf, system=SMALL)
     assert ok == n == len(read_track(path))
     # a kept frame takes 72 kB, so that a tenth of them would exceed this
