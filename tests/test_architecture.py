@@ -25,8 +25,10 @@ ROOMS = (
     "analysis",
     "tracking",
     "performance",
+    "characterisation",
     "io",
     "report",
+    "paper",
     "cli",
 )
 

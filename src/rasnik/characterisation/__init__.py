@@ -1,0 +1,1 @@
+"""How good a measurement is: from images and tracks of the instrument itself."""
