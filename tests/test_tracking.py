@@ -202,7 +202,7 @@ def test_frames_are_tracked_as_well_as_fitted(
 def test_a_stream_is_tracked_like_a_sequence(
     small: System, frames: Callable[..., list[Image]]
 ) -> None:
-    shifts = 0.004 * np.arange(90)
+    shifts = 0.006 * np.arange(120)
     images = frames(*shifts)
     tracker = Tracker(small)
     poses = [tracker.update(image) for image in images]

@@ -56,15 +56,19 @@ EX = N_SIGNALS + 4
 EY = EX + 5 * (2 * MAX_REACH - 1)
 M00 = EY + 5 * (2 * MAX_REACH - 1)
 M10, M01, M20, M02, M11 = M00 + 1, M00 + 2, M00 + 3, M00 + 4, M00 + 5
-M31, M13, M22, M40, M04 = M00 + 6, M00 + 7, M00 + 8, M00 + 9, M00 + 10
-DENSITY = M00 + 11
+M31, M13, M22, M21, M12 = M00 + 6, M00 + 7, M00 + 8, M00 + 9, M00 + 10
+M32, M23, M30, M03, M40, M04 = M00 + 11, M00 + 12, M00 + 13, M00 + 14, M00 + 15, M00 + 16
+DENSITY, DENSITY_X, DENSITY_Y = M00 + 17, M00 + 18, M00 + 19
 # orders of the derivatives in the rows from M00 on
 ORDERS = np.array(
-    [[0, 0], [1, 0], [0, 1], [2, 0], [0, 2], [1, 1], [3, 1], [1, 3], [2, 2], [4, 0], [0, 4]]
+    [
+        *([0, 0], [1, 0], [0, 1], [2, 0], [0, 2], [1, 1], [3, 1], [1, 3], [2, 2]),
+        *([2, 1], [1, 2], [3, 2], [2, 3], [3, 0], [0, 3], [4, 0], [0, 4]),
+    ]
 )
-DERIVATIVES = np.array([3, 9, 11])  # how many of them for 3, 4, 5 orders
-SCRATCH = M00 + 12
-WX = SCRATCH + 5
+DERIVATIVES = np.array([3, 15, 17])  # how many of them for 3, 4, 5 orders
+SCRATCH = M00 + 20
+WX = SCRATCH + 7
 WY = WX + 5 * 2 * MAX_REACH
 TT = WY + 5 * 2 * MAX_REACH
 SUMS = TT + (2 * MAX_REACH) ** 2
@@ -224,6 +228,8 @@ def one_corner(work, index, corners, width, origin, orders):
         work[SCRATCH + 2, lane] = left + twist * x0
         work[SCRATCH + 3, lane] = abs(below) * (_ONE - y0) + abs(below + twist) * y0
         work[SCRATCH + 4, lane] = abs(left) * (_ONE - x0) + abs(left + twist) * x0
+        work[SCRATCH + 5, lane] = abs(below + twist) - abs(below)
+        work[SCRATCH + 6, lane] = abs(left + twist) - abs(left)
     for lane in range(LANES):
         work[M10, lane] = work[EX + 1, lane] * work[SCRATCH + 1, lane]
         work[M01, lane] = work[EY + 1, lane] * work[SCRATCH + 2, lane]
@@ -236,15 +242,31 @@ def one_corner(work, index, corners, width, origin, orders):
         y1 = work[EY + 1, lane]
         work[M20, lane] = work[EX + 2, lane] * along_x
         work[M02, lane] = work[EY + 2, lane] * along_y
-        work[DENSITY, lane] = x1 * work[SCRATCH + 3, lane] + y1 * work[SCRATCH + 4, lane]
+        y2 = work[EY + 2, lane]
+        x2 = work[EX + 2, lane]
+        contour_x = work[SCRATCH + 3, lane]  # how much of the contours across x is felt
+        contour_y = work[SCRATCH + 4, lane]
+        work[DENSITY, lane] = x1 * contour_x + y1 * contour_y
+        work[DENSITY_X, lane] = x2 * contour_x + y1 * x1 * work[SCRATCH + 6, lane]
+        work[DENSITY_Y, lane] = y2 * contour_y + x1 * y1 * work[SCRATCH + 5, lane]
     for lane in range(LANES):
         twist = work[SCRATCH, lane]
         x1 = work[EX + 1, lane]
         y1 = work[EY + 1, lane]
         work[M11, lane] = twist * x1 * y1
-        work[M31, lane] = twist * work[EX + 3, lane] * y1
-        work[M13, lane] = twist * x1 * work[EY + 3, lane]
-        work[M22, lane] = twist * work[EX + 2, lane] * work[EY + 2, lane]
+        x2 = twist * work[EX + 2, lane]
+        y2 = work[EY + 2, lane]
+        x3 = twist * work[EX + 3, lane]
+        y3 = work[EY + 3, lane]
+        work[M31, lane] = x3 * y1
+        work[M13, lane] = twist * x1 * y3
+        work[M22, lane] = x2 * y2
+        work[M21, lane] = x2 * y1
+        work[M12, lane] = twist * x1 * y2
+        work[M32, lane] = x3 * y2
+        work[M23, lane] = x2 * y3
+        work[M30, lane] = work[EX + 3, lane] * work[SCRATCH + 1, lane]
+        work[M03, lane] = y3 * work[SCRATCH + 2, lane]
     if orders == 5:
         for lane in range(LANES):
             work[M40, lane] = work[EX + 4, lane] * work[SCRATCH + 1, lane]
@@ -306,22 +328,31 @@ def weights(work, profile, weight, reach, orders):
 def edge_densities(work, reach):
     """Length of black-white edge per pixel, folded with the profile's slope.
 
-    This is minus the change of M when every black field grows by a small distance.
+    This is minus the change of M when every black field grows by a small distance; its
+    derivatives along X and Y are worked out too.
     """
     sides = 2 * reach
     edges = sides - 1
     for lane in range(LANES):
         work[DENSITY, lane] = np.float32(0.0)
+        work[DENSITY_X, lane] = np.float32(0.0)
+        work[DENSITY_Y, lane] = np.float32(0.0)
     for edge in range(edges):
         for side in range(sides):
             here = TT + side * sides + edge
+            e1, w = EX + edges + edge, WY + side
             for lane in range(LANES):
                 step = abs(work[here + 1, lane] - work[here, lane])
-                work[DENSITY, lane] += step * work[EX + edges + edge, lane] * work[WY + side, lane]
+                work[DENSITY, lane] += step * work[e1, lane] * work[w, lane]
+                work[DENSITY_X, lane] += step * work[e1 + edges, lane] * work[w, lane]
+                work[DENSITY_Y, lane] += step * work[e1, lane] * work[w + sides, lane]
             here = TT + edge * sides + side
+            e1, w = EY + edges + edge, WX + side
             for lane in range(LANES):
                 step = abs(work[here + sides, lane] - work[here, lane])
-                work[DENSITY, lane] += step * work[EY + edges + edge, lane] * work[WX + side, lane]
+                work[DENSITY, lane] += step * work[e1, lane] * work[w, lane]
+                work[DENSITY_X, lane] += step * work[e1, lane] * work[w + sides, lane]
+                work[DENSITY_Y, lane] += step * work[e1 + edges, lane] * work[w, lane]
 
 
 @_compiled
@@ -370,6 +401,7 @@ def add_part(work, shape, share, orders):
     k04 = share * np.float32(shape[9])
     shift = np.float32(shape[10])
     shared_shift = share * shift
+    half_shift = _HALF * shift
     if orders == 3:
         for lane in range(LANES):
             work[0, lane] += share * work[M10, lane]
@@ -383,8 +415,20 @@ def add_part(work, shape, share, orders):
         q02 = work[M02, lane]
         density = work[DENSITY, lane]
         curvature = shift * (q20 + q02)
-        work[0, lane] += share * work[M10, lane]
-        work[1, lane] += share * work[M01, lane]
+        work[0, lane] += (
+            share * work[M10, lane]
+            + c11 * work[M21, lane]
+            + c22 * work[M32, lane]
+            + shared_shift
+            * (half_shift * (work[M30, lane] + work[M12, lane]) - work[DENSITY_X, lane])
+        )
+        work[1, lane] += (
+            share * work[M01, lane]
+            + c11 * work[M12, lane]
+            + c22 * work[M23, lane]
+            + shared_shift
+            * (half_shift * (work[M03, lane] + work[M21, lane]) - work[DENSITY_Y, lane])
+        )
         work[3, lane] += (
             share * work[M00, lane]
             + c11 * q11

@@ -38,6 +38,7 @@ _careful = njit(
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _LARGEST = np.float32(127.0)
+_GOLDEN = np.float32(0.6180339887)  # its multiples are spread evenly between whole numbers
 
 
 @_compiled
@@ -77,12 +78,12 @@ def store(
     a, b, floor = np.float32(noise[0]), np.float32(noise[1]), np.float32(noise[2])
     work = np.zeros((WORK_ROWS, STRIDE), dtype=np.float32)
     index = np.zeros((3, TILE * TILE), dtype=np.int32)
-    buffer = np.zeros((kept + 1, TILE * wide), dtype=np.float32)
+    weighted = np.zeros((kept + 1, TILE * wide), dtype=np.float32)
     plain = np.zeros((kept, TILE * wide), dtype=np.float32)
     for t in range(first, last):
         row0 = (t // across) * TILE
         rows = min(TILE, height - row0)
-        buffer[:] = _ZERO
+        weighted[:] = _ZERO
         counts[t] = 0.0
         for part in range(parts):
             column0 = (t % across) * wide + part * TILE
@@ -99,11 +100,8 @@ def store(
                     work[ROOT, lane] = np.float32(good)
                     counts[t, 0] += good
                     level[row0 + row, column0 + column] = work[LEVEL, lane]
-            for row in range(TILE):
-                to = row * wide + part * TILE
-                for s in range(kept):
-                    for column in range(TILE):
-                        plain[s, to + column] = work[s, row * TILE + column]
+            for s in range(kept):
+                _to_tile(work[s], plain[s], part * TILE, wide)
             for lane in range(TILE * TILE):
                 work[ROOT, lane] /= np.sqrt(max(a + b * work[LEVEL, lane], floor))
             for s in range(_N_MODEL):
@@ -112,30 +110,50 @@ def store(
             k = 0
             for s in range(_N_MODEL):
                 for other in range(s, _N_MODEL):
-                    total = _ZERO
-                    for lane in range(TILE * TILE):
-                        total += work[s, lane] * work[other, lane]
-                    products[t, part, k] = total
+                    products[t, part, k] = _dot_rows(work[s], work[other], TILE * TILE)
                     k += 1
-            for row in range(TILE):
-                to = row * wide + part * TILE
-                for column in range(TILE):
-                    root = work[ROOT, row * TILE + column]
-                    for s in range(kept):
-                        buffer[s, to + column] = work[s, row * TILE + column] * root
-                    buffer[kept, to + column] = root * root
-        counts[t, 1] = buffer[DARK].sum()
-        counts[t, 2] = buffer[LIGHT].sum()
-        scales[t, kept] = _quantise_evenly(buffer[kept], weights[t, kept])
+            for s in range(kept):
+                for lane in range(TILE * TILE):
+                    work[s, lane] *= work[ROOT, lane]
+                _to_tile(work[s], weighted[s], part * TILE, wide)
+            for lane in range(TILE * TILE):
+                work[ROOT, lane] *= work[ROOT, lane]
+            _to_tile(work[ROOT], weighted[kept], part * TILE, wide)
+        counts[t, 1] = weighted[DARK].sum()
+        counts[t, 2] = weighted[LIGHT].sum()
+        scales[t, kept] = _quantise_evenly(weighted[kept], weights[t, kept])
         for s in range(kept):
-            scales[t, s] = _quantise(buffer[s], weights[t, s])
-            for k in range(buffer.shape[1]):
-                buffer[s, k] = scales[t, s] * np.float32(weights[t, s, k]) - buffer[s, k]
+            scales[t, s] = _quantise(weighted[s], weights[t, s])
             for other in range(kept):
-                total = _ZERO
-                for k in range(buffer.shape[1]):
-                    total += buffer[s, k] * plain[other, k]
-                rounding[t, s, other] = total
+                rounded = scales[t, s] * _dot(
+                    plain[other], weights[t, s], np.uint32(0), TILE * wide
+                )
+                exact = _dot_rows(weighted[s], plain[other], TILE * wide)
+                rounding[t, s, other] = rounded - exact
+
+
+@_compiled
+def _to_tile(lanes, tile, first, wide):
+    """Copy TILE x TILE lanes to where they belong in a wider tile."""
+    for row in range(TILE):
+        for column in range(TILE):
+            tile[np.uint32(row * wide + first + column)] = lanes[np.uint32(row * TILE + column)]
+
+
+@_careful
+def _dot(values, weights, start, size):
+    total = _ZERO
+    for k in range(size):
+        total += values[k] * np.float32(weights[start + np.uint32(k)])
+    return total
+
+
+@_compiled
+def _dot_rows(first, second, size):
+    total = _ZERO
+    for k in range(size):
+        total += first[np.uint32(k)] * second[np.uint32(k)]
+    return total
 
 
 @_compiled
@@ -153,20 +171,17 @@ def _quantise(values, integers):
 
 @_compiled
 def _quantise_evenly(values, integers):
-    """The same for values that are hardly different: what rounding takes, the next one gets."""
+    """The same for values that hardly differ: as often up as down, so that their sum stays."""
     largest = _ZERO
     for k in range(values.size):
         largest = max(largest, values[k])
     unit = largest / (_LARGEST - _ONE)
     factor = _ONE / unit if unit > _ZERO else _ZERO
-    rest = _ZERO
     for k in range(values.size):
-        if values[k] > _ZERO:
-            wanted = values[k] * factor + rest
-            integers[k] = np.int8(np.rint(wanted))
-            rest = wanted - np.float32(integers[k])
-        else:
-            integers[k] = 0
+        turn = np.float32(k) * _GOLDEN
+        wanted = values[k] * factor
+        threshold = turn - np.floor(turn) if wanted > _ZERO else _ZERO
+        integers[k] = np.int8(np.floor(wanted + threshold))
     return unit
 
 
@@ -175,14 +190,6 @@ def _residuals(pixels, start, level, at, residual, to, count):
     for k in range(count):
         j = np.uint32(k)
         residual[to + j] = np.float32(pixels[start + j]) - level[at + j]
-
-
-@_careful
-def _dot(residual, weights, start, size):
-    total = _ZERO
-    for k in range(size):
-        total += residual[k] * np.float32(weights[start + np.uint32(k)])
-    return total
 
 
 @_careful

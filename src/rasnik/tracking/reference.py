@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from rasnik.analysis.flags import Flag
 from rasnik.analysis.frame import Frame
+from rasnik.analysis.gauss_newton import iterate
+from rasnik.analysis.moments import all_tiles
 from rasnik.analysis.outliers import estimate_noise, find_outliers
 from rasnik.analysis.parameters import POSE_SIZE, Model, State
 from rasnik.analysis.pose import Pose
@@ -18,23 +20,21 @@ from rasnik.tracking import kernels
 from rasnik.tracking.linearisation import Builder, Linearisation, Settings
 
 __all__ = [
-    "CONVERGENT",
     "LIGHT_USABLE",
     "NEAR",
     "USABLE",
     "Reading",
     "Reference",
+    "approach",
     "build",
     "model_of",
     "vector_of",
 ]
 
 #: Motions in units of the edge width: where a new reference is wanted, and how far the present
-#: one can be used. The error grows from 5 pm to some 30 pm (85 um fields).
-NEAR = 0.02
-USABLE = 0.1
-#: As far as a step still points in the right direction.
-CONVERGENT = 1.0
+#: one can be used. For 85 um fields that is 0.2 um, with errors of 2 pm, and 0.45 um with 20 pm.
+NEAR = 0.04
+USABLE = 0.09
 
 #: Relative changes of the contrast, likewise.
 _LIGHT_NEAR, LIGHT_USABLE = 0.05, 0.25
@@ -44,6 +44,7 @@ _MISFIT = 1.15
 _MISFIT_DRIFT = 0.1
 _CURVATURE = 0.1
 _SURPRISE = 45.0
+_COARSE_STRIDE = 13  # tiles; shares no factor with their usual number in a row
 _AVERAGED = 64  # frames over which the chi-square that is expected follows the one seen
 
 #: What a pose keeps of the flags of the fit that the reference began with.
@@ -105,6 +106,8 @@ class Reference:
     growth: NDArray[np.float64] = field(default_factory=lambda: np.ones(4))
     chi2_ratio: float = 1.0
     surprise: NDArray[np.float64] | float = 0.0
+    begun: float | None = None
+    """When the mask was first seen near this reference, in frames."""
 
     @classmethod
     def from_fit(cls, frame: Frame, pose: Pose, free: bool) -> tuple[Reference, Reading]:
@@ -154,7 +157,7 @@ class Reference:
     def moved_to(self, linear: Linearisation) -> Reference:
         """The same expectations about another linearisation."""
         linear.limits[:] = self.linear.limits
-        return replace(self, linear=linear)
+        return replace(self, linear=linear, begun=None)
 
     # ----------------------------------------------------------------- reading frames
 
@@ -310,6 +313,29 @@ class Reference:
             projection=state.projection,
             appearance=state.appearance,
         )
+
+
+def approach(frame: Frame, settings: Settings, state: State) -> State | None:
+    """A state near the frame's, from a twelfth of its pixels; None if it is not found.
+
+    Parameters
+    ----------
+    frame : Frame
+    settings : Settings
+    state : State
+        Within a quarter of a field, and any light.
+    """
+    tiles = all_tiles(settings.camera.shape)[::_COARSE_STRIDE]
+    frame = replace(frame, mask=settings.mask, valid=settings.valid)
+    kurtosis = state.appearance.kurtosis != 0.0
+    try:
+        found = iterate(
+            frame, settings.noise, state, settings.model, kurtosis, tiles, 8,
+            trim=True, fixed_shape=True,
+        )  # fmt: skip
+    except ValueError:  # a state that cannot be modelled
+        return None
+    return found.state if found.converged else None
 
 
 def build(settings: Settings, state: State) -> Linearisation:

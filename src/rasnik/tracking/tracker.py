@@ -20,19 +20,19 @@ from numpy.typing import NDArray
 
 from rasnik.analysis.analyse import analyse
 from rasnik.analysis.flags import Flag
-from rasnik.analysis.frame import Bounds, prepare_frame, resolve_instrument
+from rasnik.analysis.frame import Bounds, Frame, prepare_frame, resolve_instrument
 from rasnik.analysis.parameters import POSE_SIZE, Model, State
 from rasnik.analysis.pose import Pose
 from rasnik.instrument import System
 from rasnik.tracking.linearisation import Builder
 from rasnik.tracking.motion import Motion
 from rasnik.tracking.reference import (
-    CONVERGENT,
     LIGHT_USABLE,
     NEAR,
     USABLE,
     Reading,
     Reference,
+    approach,
     build,
     model_of,
     vector_of,
@@ -44,7 +44,8 @@ __all__ = ["Tracker"]
 Image = NDArray[Any]
 
 _SLICES = 24  # frames over which a new reference is made in a stream
-_ATTEMPTS = 3  # references tried on one frame that moved
+_SOON = 32  # frames; a reference that lasts as long need not be set ahead
+_NO_OTHER = 20  # times the range of a reference: guesses so close lead to the same place
 _PATIENCE = 3  # frames with something in the way before that is taken as lasting
 _MORE_MASKED = 5e-4
 _PERIODS = 32  # frames over which the period is averaged
@@ -97,9 +98,10 @@ class Tracker:
         self._shape = None if self.system is None else self.system.shape
         self._prior = prior
         self._reference: Reference | None = None
-        self._last_reading: Reading | None = None
+        self._last: tuple[Reference, Reading] | None = None  # that fitted
         self._builder: Builder | None = None
         self._motion = Motion()
+        self._began_at = np.zeros(4)  # the step when the reference came into use
         self._odd = 0  # frames in a row that a fit explained less well
         self._at_once = _MOST_AT_ONCE
         self._clock = 0.0  # frames since the beginning, lost ones included
@@ -277,26 +279,35 @@ class Tracker:
     def _accept(self, reference: Reference, reading: Reading, clock: list[float]) -> None:
         """Learn from frames that fit."""
         reference.learn(reading)
+        if reference.begun is None:
+            reference.begun, self._began_at = clock[0], reading.steps[0, :4].copy()
         for time, step in zip(clock[-3:], reading.steps[-3:], strict=True):
             self._motion.add(time, reference.vector + step[:4])
-        self._last_reading = reading[len(reading) - 1 :]
+        self._last = reference, reading[len(reading) - 1 :]
         self._odd = 0
 
     # ----------------------------------------------------------------- new references
 
     def _follow(self, reference: Reference, reading: Reading) -> None:
-        """A new reference, a little ahead of where the mask is."""
-        velocity = self._motion.velocity
-        speed = float(np.hypot(*velocity[:2]))
-        frames = 0.0 if speed < 0.1 * reference.near_um else 0.8 * reference.near_um / speed
-        self._replace(reference, self._ahead(reference, reading, frames))
+        """A new reference where the mask is, or ahead of it if it moves fast."""
+        velocity = self._velocity(reference, reading)
+        speed = _distance(velocity)
+        fast = speed > reference.near_um / _SOON
+        self._replace(reference, reading, 0.7 * reference.near_um / speed if fast else 0.0)
+
+    def _velocity(self, reference: Reference, reading: Reading) -> NDArray[np.float64]:
+        """Mean change of the pose per frame since the reference came into use, shape (4,)."""
+        if reference.begun is None or reference.begun == self._clock:
+            return np.zeros(4)
+        return (reading.steps[0, :4] - self._began_at) / (self._clock - reference.begun)
 
     def _ahead(self, reference: Reference, reading: Reading, frames: float) -> State:
         step = reading.steps[0].copy()
-        step[:4] += frames * self._motion.velocity
+        step[:4] += frames * self._velocity(reference, reading)
         return reference.linear.stepped(step)
 
-    def _replace(self, reference: Reference, state: State) -> None:
+    def _replace(self, reference: Reference, reading: Reading, frames: float) -> None:
+        state = self._ahead(reference, reading, frames)
         try:
             self._reference = reference.moved_to(build(reference.linear.settings, state))
         except ValueError:  # a state that cannot be modelled; the next frame decides
@@ -339,59 +350,50 @@ class Tracker:
         if reference is None or reading is None:
             return self._fit(grey, arrival, self._prior)
         if not reference.usable(reading)[0]:
-            for step in self._guesses(reference, reading):
-                found = self._relocate(reference, grey, step)
+            for state in self._guesses():
+                found = self._relocate(reference, grey, state)
                 if found is not None:
                     self._reference, close = found
                     self._accept(self._reference, close, [self._clock])
                     flags = Flag.REFITTED | arrival | _changes(reference, reading)
                     return self._reference.pose(close, flags)
-        return self._fit(grey, arrival, self._expected(reference))
+        return self._fit(grey, arrival, self._expected())
 
-    def _guesses(self, reference: Reference, reading: Reading) -> Iterator[NDArray[np.float64]]:
-        """Steps to where the mask may be: as extrapolated, and as the reference has it."""
+    def _guesses(self) -> Iterator[State]:
+        """Where the mask may be: as extrapolated, and where it was."""
+        if self._last is None:
+            return
+        reference, reading = self._last
+        step = reading.steps[0].copy()
         predicted = self._motion.predict(self._clock)
-        step = reading.steps[0]
-        plausible = bool(reference.motion(reading)[0] < CONVERGENT)
-        if predicted is not None and not plausible:
-            guess = np.zeros_like(step)
-            guess[:4] = predicted - reference.vector
-            if _distance(guess[:4]) > 2 * reference.near_um:
-                yield guess
-        if plausible:
-            yield step
+        if predicted is not None:
+            ahead = step.copy()
+            ahead[:4] = predicted - reference.vector
+            yield reference.linear.stepped(ahead)
+            if _distance(ahead - step) < _NO_OTHER * reference.near_um:
+                return
+        yield reference.linear.stepped(step)
 
     def _relocate(
-        self, reference: Reference, grey: Image, step: NDArray[np.float64]
+        self, reference: Reference, grey: Image, state: State
     ) -> tuple[Reference, Reading] | None:
-        """A reference that explains the frame, begun from a step; None if there is none."""
-        linear = reference.linear
-        for _ in range(_ATTEMPTS):
-            try:
-                linear = build(linear.settings, linear.stepped(step))
-            except ValueError:
-                return None
-            self.references += 1
-            moved = reference.moved_to(linear)
-            reading = moved.read([grey])
-            if moved.usable(reading)[0]:
-                return (moved, reading) if moved.explains(reading)[0] else None
-            if not moved.motion(reading)[0] < CONVERGENT:
-                return None
-            step = reading.steps[0]
-        return None
-
-    def _expected(self, reference: Reference) -> Pose | None:
-        """The last pose that was tracked, moved to where the mask should be now."""
-        if self._last_reading is None:
+        """A reference that explains the frame, begun from a guess; None if there is none."""
+        settings = reference.linear.settings
+        near = approach(self._prepared(grey), settings, state)
+        if near is None:
             return None
-        pose = reference.pose(self._last_reading)
-        predicted = self._motion.predict(self._clock)
-        if predicted is None or pose.projection is None or pose.appearance is None:
-            return pose
-        step = np.zeros(reference.linear.n_parameters)
-        step[:4] = predicted - reference.vector
-        state = reference.linear.stepped(step)
+        moved = reference.moved_to(build(settings, near))
+        self.references += 1
+        reading = moved.read([grey])
+        good = moved.usable(reading)[0] and moved.explains(reading)[0]
+        return (moved, reading) if good else None
+
+    def _expected(self) -> Pose | None:
+        """The last pose that was tracked, moved to where the mask should be now."""
+        if self._last is None:
+            return None
+        pose = self._last[0].pose(self._last[1])
+        state = next(self._guesses())
         return replace(pose, projection=state.projection)
 
     def _fit(self, grey: Image, arrival: Flag, prior: Pose | None) -> Pose:
@@ -419,14 +421,16 @@ class Tracker:
 
     def _begin(self, grey: Image, pose: Pose) -> None:
         """Track from a full fit on."""
-        frame, _ = prepare_frame(
-            grey, self._mask, self._pitch_um, self.system, self._options["bounds"]
-        )
         free = self._options["model"] == "auto"
-        self._reference, self._last_reading = Reference.from_fit(frame, pose, free)
+        self._last = Reference.from_fit(self._prepared(grey), pose, free)
+        self._reference = self._last[0]
         self.references += 1
         self._odd = 0
         self._motion.add(self._clock, self._reference.vector)
+
+    def _prepared(self, grey: Image) -> Frame:
+        bounds = self._options["bounds"]
+        return prepare_frame(grey, self._mask, self._pitch_um, self.system, bounds)[0]
 
     # ----------------------------------------------------------------- arrival
 
