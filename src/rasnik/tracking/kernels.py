@@ -27,7 +27,7 @@ MASK_X, MASK_Y, DARK, LIGHT, BLUR_VARIANCE = range(5)
 _N_MODEL = 7
 _N_MONOMIALS = 6
 _PASSES = 4
-_CONVERGED = 1e-3  # relative; the next pass changes its square
+_CONVERGED = 1e-5  # relative
 _FEW = 64.0  # pixels; tiles with fewer are not judged
 
 _compiled = njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
