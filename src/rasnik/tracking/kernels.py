@@ -27,7 +27,6 @@ MASK_X, MASK_Y, DARK, LIGHT, BLUR_VARIANCE = range(5)
 _N_MODEL = 7
 _N_MONOMIALS = 6
 _PASSES = 4
-_CONVERGED = 1e-5  # relative
 _FEW = 64.0  # pixels; tiles with fewer are not judged
 
 _compiled = njit(cache=True, fastmath=True, error_model="numpy", nogil=True)
@@ -285,7 +284,19 @@ def _amplitudes(t, step, n_pose, lever, basis, contrast, units, curvature, ampli
 
 @_careful
 def _refine(
-    step, matrix, n_pose, lever, basis, contrast, units, curvature, grams, beyond, amplitude, excess
+    step,
+    matrix,
+    n_pose,
+    lever,
+    basis,
+    contrast,
+    units,
+    curvature,
+    grams,
+    negligible,
+    beyond,
+    amplitude,
+    excess,
 ):
     """Take out of a step what the linear estimator makes of terms that are not linear."""
     tiles, kept = grams.shape[0], grams.shape[1]
@@ -306,16 +317,16 @@ def _refine(
         for k in range(step.size):
             new = first[k] - change[k]
             if k < 2:
-                moved = max(moved, abs(new - step[k]) / (abs(new) + 1e-12))
+                moved = max(moved, abs(new - step[k]))
             step[k] = new
-        if moved < _CONVERGED:
+        if moved < negligible:
             break
 
 
 @_careful
 def estimate(
     frame, parts, level, weights, scales, matrix, n_pose, lever, basis, contrast, units,
-    curvature, grams, within, counts, noise_slope, limits, step, statistics,
+    curvature, grams, within, counts, noise_slope, limits, negligible, step, statistics,
 ):  # fmt: skip
     """The step from the reference to a frame, and how well that explains it.
 
@@ -347,6 +358,8 @@ def estimate(
         B of the variance A + B g.
     limits : float64, shape (tiles,)
         Chi-square per expected chi-square above which a tile does not fit.
+    negligible : float
+        A change of x and y too small to matter, um.
     step, statistics : float64
         Receive the step with the extra rows, and the N_STATISTICS figures: chi-square; what is
         expected of it at this light; the largest of chi-square over limit among the tiles; the
@@ -362,19 +375,9 @@ def estimate(
     _sum_frame(frame, parts, level, weights, scales, sums, energies)
     _apply(matrix, sums, step)
     _refine(
-        step,
-        matrix,
-        n_pose,
-        lever,
-        basis,
-        contrast,
-        units,
-        curvature,
-        grams,
-        beyond,
-        amplitude,
-        excess,
-    )
+        step, matrix, n_pose, lever, basis, contrast, units, curvature, grams, negligible,
+        beyond, amplitude, excess,
+    )  # fmt: skip
     statistics[:] = 0.0
     for t in range(tiles):
         motion, ratio = _amplitudes(

@@ -40,6 +40,7 @@ _N = model_kernels.N_SIGNALS - 1
 _PAIRS = _N * (_N + 1) // 2
 _EXPAND = symmetric_index(_N)
 _TILE_SIGMAS = 7.0
+_NEGLIGIBLE = 1e-3  # sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,8 +348,12 @@ class Linearisation:
             frame, self.parts, self.level, self.weights, self.scales, self.matrix,
             POSE_SIZE[self.settings.model], self.lever, self.basis, self.contrast, self.units,
             self.curvature, self.grams, self.within, self.counts, self.settings.noise[1],
-            self.limits, step, statistics,
+            self.limits, self._negligible, step, statistics,
         )  # fmt: skip
+
+    @cached_property
+    def _negligible(self) -> float:
+        return _NEGLIGIBLE * float(np.sqrt(self.covariance[0, 0]))
 
     @property
     def n_steps(self) -> int:

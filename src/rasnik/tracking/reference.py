@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -32,9 +33,9 @@ __all__ = [
 ]
 
 #: Motions in units of the edge width: where a new reference is wanted, and how far the present
-#: one can be used. For 85 um fields that is 0.2 um, with errors of 2 pm, and 0.45 um with 20 pm.
+#: one can be used. For 85 um fields that is 0.2 um, with errors of 2 pm, and 0.35 um with 15 pm.
 NEAR = 0.04
-USABLE = 0.09
+USABLE = 0.07
 
 #: Relative changes of the contrast, likewise.
 _LIGHT_NEAR, LIGHT_USABLE = 0.05, 0.25
@@ -137,7 +138,7 @@ class Reference:
         noise = frame.noise or estimate_noise(frame.image, valid, *arguments)
         settings = Settings(frame.mask, frame.camera, noise, model_of(pose), free, valid)
         reference = cls(build(settings, state), pose)
-        sigmas = np.sqrt(np.diag(pose.covariance) / np.diag(reference._covariance()))
+        sigmas = np.sqrt(np.diag(pose.covariance) / np.diag(reference._covariance))
         enlarged = pose.flags & (Flag.MODEL_MISFIT | Flag.NOISE_ESTIMATED)
         reference.growth = np.maximum(sigmas, 1.0) if enlarged else np.ones(4)
         reading = reference.read([frame.image])
@@ -247,11 +248,12 @@ class Reference:
     def flags(self) -> Flag:
         return self.origin.flags & _LASTING
 
-    @property
+    @cached_property
     def vector(self) -> NDArray[np.float64]:
         """(x, y, ln S, theta) of the reference, shape (4,)."""
         return vector_of(self.linear.state, self.origin.orientation)
 
+    @cached_property
     def _covariance(self) -> NDArray[np.float64]:
         """Of x, y, S, theta_z from the noise, at the reference."""
         unit = np.array([1.0, 1.0, np.exp(self.vector[2]), 1.0])
@@ -273,7 +275,7 @@ class Reference:
         light = POSE_SIZE[self.linear.settings.model]
         appearance = self.linear.state.appearance
         factor = self._noise_factor(reading)
-        sigma = np.sqrt(np.diag(self._covariance())) * self.growth
+        sigma = np.sqrt(np.diag(self._covariance)) * self.growth
         return {
             "x_um": x + steps[0],
             "y_um": y + steps[1],
@@ -302,7 +304,7 @@ class Reference:
             name: float(np.ravel(v)[0]) for name, v in self.columns(reading).items()
         }
         growth = self.growth * self._noise_factor(reading)[0]
-        covariance = self._covariance() * np.outer(growth, growth)
+        covariance = self._covariance * np.outer(growth, growth)
         return replace(
             self.origin,
             **{name: value for name, value in values.items() if not name.startswith("sigma")},
