@@ -24,6 +24,7 @@ from rasnik.analysis.frame import Bounds, Frame, prepare_frame, resolve_instrume
 from rasnik.analysis.parameters import POSE_SIZE, Model, State
 from rasnik.analysis.pose import Pose
 from rasnik.instrument import System
+from rasnik.tracking.arrival import Arrivals
 from rasnik.tracking.linearisation import Builder
 from rasnik.tracking.motion import Motion
 from rasnik.tracking.reference import (
@@ -48,7 +49,6 @@ _SOON = 32  # frames; a reference that lasts as long need not be set ahead
 _NO_OTHER = 20  # times the range of a reference: guesses so close lead to the same place
 _PATIENCE = 3  # frames with something in the way before that is taken as lasting
 _MORE_MASKED = 5e-4
-_PERIODS = 32  # frames over which the period is averaged
 _MOST_AT_ONCE = 64  # frames
 _AS_STORED = ("uint8", "uint16", "float32")
 
@@ -104,9 +104,7 @@ class Tracker:
         self._began_at = np.zeros(4)  # the step when the reference came into use
         self._odd = 0  # frames in a row that a fit explained less well
         self._at_once = _MOST_AT_ONCE
-        self._clock = 0.0  # frames since the beginning, lost ones included
-        self._number, self._time_s = -1, float("nan")  # of the last frame
-        self._period_s: float | None = None
+        self._arrivals = Arrivals()
         #: Number of references made so far.
         self.references = 0
 
@@ -133,7 +131,7 @@ class Tracker:
         Pose
             With the flags of tracking: what was done and why.
         """
-        arrival = self._take_note(t, number)
+        arrival = self._arrivals.add(t, number)
         grey = self._usable_frame(frame)
         if grey is None:
             return Pose(flags=Flag.NO_IMAGE | arrival)
@@ -143,7 +141,7 @@ class Tracker:
         reading = reference.read([grey])
         if not reference.fits(reading)[0]:
             return self._recover(grey, reading, arrival)
-        self._accept(reference, reading, [self._clock])
+        self._accept(reference, reading, [self._arrivals.clock])
         self._work_ahead(reference, reading)
         return reference.pose(reading, arrival)
 
@@ -269,8 +267,8 @@ class Tracker:
         clock = []
         arrivals = zip(columns["time_s"][rows], columns["frame"][rows], strict=True)
         for k, (t, number) in enumerate(arrivals, rows.start):
-            columns["flags"][k] = int(reference.flags | self._take_note(t, number))
-            clock.append(self._clock)
+            columns["flags"][k] = int(reference.flags | self._arrivals.add(t, number))
+            clock.append(self._arrivals.clock)
         self._accept(reference, reading, clock)
         if not near[n - 1]:
             self._follow(reference, reading[n - 1 :])
@@ -297,9 +295,9 @@ class Tracker:
 
     def _velocity(self, reference: Reference, reading: Reading) -> NDArray[np.float64]:
         """Mean change of the pose per frame since the reference came into use, shape (4,)."""
-        if reference.begun is None or reference.begun == self._clock:
+        if reference.begun is None or reference.begun == self._arrivals.clock:
             return np.zeros(4)
-        return (reading.steps[0, :4] - self._began_at) / (self._clock - reference.begun)
+        return (reading.steps[0, :4] - self._began_at) / (self._arrivals.clock - reference.begun)
 
     def _ahead(self, reference: Reference, reading: Reading, frames: float) -> State:
         step = reading.steps[0].copy()
@@ -308,6 +306,7 @@ class Tracker:
 
     def _replace(self, reference: Reference, reading: Reading, frames: float) -> None:
         state = self._ahead(reference, reading, frames)
+        self._builder = None
         try:
             self._reference = reference.moved_to(build(reference.linear.settings, state))
         except ValueError:  # a state that cannot be modelled; the next frame decides
@@ -336,7 +335,7 @@ class Tracker:
 
     def _look_closer(self, frame: Image | None, t: float, number: int) -> Pose:
         """The pose in a frame that did not fit, or for which there is no reference."""
-        arrival = self._take_note(t, number)
+        arrival = self._arrivals.add(t, number)
         grey = self._usable_frame(frame)
         if grey is None:
             return Pose(flags=Flag.NO_IMAGE | arrival)
@@ -354,7 +353,7 @@ class Tracker:
                 found = self._relocate(reference, grey, state)
                 if found is not None:
                     self._reference, close = found
-                    self._accept(self._reference, close, [self._clock])
+                    self._accept(self._reference, close, [self._arrivals.clock])
                     flags = Flag.REFITTED | arrival | _changes(reference, reading)
                     return self._reference.pose(close, flags)
         return self._fit(grey, arrival, self._expected())
@@ -365,7 +364,7 @@ class Tracker:
             return
         reference, reading = self._last
         step = reading.steps[0].copy()
-        predicted = self._motion.predict(self._clock)
+        predicted = self._motion.predict(self._arrivals.clock)
         if predicted is not None:
             ahead = step.copy()
             ahead[:4] = predicted - reference.vector
@@ -426,13 +425,11 @@ class Tracker:
         self._reference = self._last[0]
         self.references += 1
         self._odd = 0
-        self._motion.add(self._clock, self._reference.vector)
+        self._motion.add(self._arrivals.clock, self._reference.vector)
 
     def _prepared(self, grey: Image) -> Frame:
         bounds = self._options["bounds"]
         return prepare_frame(grey, self._mask, self._pitch_um, self.system, bounds)[0]
-
-    # ----------------------------------------------------------------- arrival
 
     def _usable_frame(self, frame: Image | None) -> Image | None:
         """The frame as the kernels take it; None if it is not an image of the right size."""
@@ -449,29 +446,6 @@ class Tracker:
         if array.dtype.kind == "f" and not np.isfinite(array.sum()):
             array = np.nan_to_num(array, nan=0.0, posinf=0.0, neginf=0.0)
         return np.ascontiguousarray(array)
-
-    def _take_note(self, t: float | None, number: int | None) -> Flag:
-        """Whether a frame's time and number follow those of the one before."""
-        flags = Flag.NONE
-        before, self._number = self._number, self._number + 1 if number is None else int(number)
-        passed = self._number - before
-        if before >= 0 and passed != 1:
-            flags |= Flag.FRAMES_LOST if passed > 1 else Flag.TIME_IRREGULAR
-        self._clock += max(passed, 1)
-        if t is None or not np.isfinite(t):
-            return flags
-        elapsed, self._time_s = t - self._time_s, float(t)
-        if not np.isfinite(elapsed):
-            return flags
-        if elapsed <= 0:
-            return flags | Flag.TIME_IRREGULAR
-        each = elapsed / max(passed, 1)
-        if self._period_s is None:
-            self._period_s = each
-        elif not 0.5 < each / self._period_s < 1.5:
-            flags |= Flag.TIME_IRREGULAR
-        self._period_s += (min(each, 2 * self._period_s) - self._period_s) / _PERIODS
-        return flags
 
     def _nominal_times(self, number: NDArray[np.int64]) -> NDArray[np.float64]:
         rate = None if self.system is None else self.system.sensor.frame_rate_hz
