@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -129,6 +130,35 @@ def test_three_per_cent_wrong_fields_never_give_a_wrong_position(rng) -> None:
         else:
             unknown += 1
     assert unknown <= 8
+
+
+@pytest.mark.parametrize("fields", [(2, 0), (0, 2), (-2, 2), (18, 0), (9, 81)])
+def test_a_torn_view_reads_as_one_of_its_parts_or_not_at_all(fields, rng) -> None:
+    """Two parts of one lattice that show the code in two places, as after a jump by whole fields."""
+    unknown = 0
+    for _ in range(60):
+        seed, orientation = rng.integers(2**32), rng.integers(1, 5)
+        views = []
+        x, y = rng.uniform(10_000, 180_000, 2)
+        for moved in ((0, 0), fields):
+            truth = Projection.from_pose(
+                x + 85 * moved[0], y + 85 * moved[1], 1.0, 0.01, orientation
+            )
+            # the same lattice, whatever the code
+            own = np.random.default_rng(seed)
+            views.append((truth, *readout_of(MASK, truth, CHANGES[0], (58, 44), own)))
+        (first, upper, lattice), (second, lower, _) = views
+        row = rng.integers(3, 42)
+        torn = replace(upper, llr=np.concatenate([upper.llr[:row], lower.llr[row:]]))
+        decoding = decode(torn, lattice, MASK)
+        unknown += not decoding.ok
+        if decoding.ok:
+            found = decoding.projection
+            apart = min(
+                np.hypot(found.x_um - one.x_um, found.y_um - one.y_um) for one in (first, second)
+            )
+            assert apart < 0.1
+    assert unknown < 60
 
 
 @pytest.mark.parametrize("bits", [4, 6, 10])
