@@ -132,6 +132,23 @@ def test_a_prior_off_by_fields_is_never_believed(fields: tuple[float, float]) ->
     assert pose.flags & Flag.PRIOR_REJECTED
 
 
+def test_a_prior_is_no_position_of_an_image_without_a_usable_pixel() -> None:
+    before = analyse(frame_at(), SMALL)
+    pose = analyse(np.full(SMALL.shape, 255, np.uint8), SMALL, prior=before)
+    assert not pose.ok and np.isnan(pose.x_um)
+    assert pose.flags & Flag.BLANK and pose.flags & Flag.SATURATED
+
+
+def test_a_prior_is_not_proven_by_a_corner_without_code() -> None:
+    before = analyse(frame_at(), SMALL)
+    frame = frame_at((POSE[0] + 85, POSE[1] + 85, POSE[2])).copy()
+    columns, rows = np.meshgrid(np.arange(300), np.arange(240))
+    # 40 x 40 pixels that no code line crosses stay as they are
+    frame[(columns < 100) | (columns >= 140) | (rows < 110) | (rows >= 150)] = 255
+    pose = analyse(frame, SMALL, prior=before)
+    assert not pose.ok and np.isnan(pose.x_um)
+
+
 def test_a_prior_of_another_orientation_is_refused() -> None:
     before = analyse(frame_at(), SMALL)
     with pytest.raises(ValueError, match="leave one of them out"):

@@ -38,6 +38,9 @@ _MOST_MOTION_FIELDS = 0.35
 _PRIOR_MOTION_FIELDS = 0.8
 _LEAST_EXPLAINED = 0.5
 _PRIOR_EXPLAINED = 0.9
+# What is left of a flash or a border does not tell whole fields apart: of the pixels that the
+# prior rests on, as many must be there.
+_PRIOR_PIXELS = 0.5
 _HEAVILY_MASKED = 0.25
 _SCALE_TOLERANCE = np.log(1.2)
 _FATAL = Flag(sum(info.flag for info in FLAGS if info.fatal))
@@ -221,6 +224,8 @@ def _from_prior(
     image then stand out, or much is left unexplained.
     """
     if prior.projection is None or prior.appearance is None:
+        return None
+    if frame.valid.mean() < _PRIOR_PIXELS * (1.0 - prior.masked_fraction):
         return None
     frame = _with_polarity(frame, prior.polarity)
     start = State(prior.projection, prior.appearance)

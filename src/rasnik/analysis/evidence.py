@@ -6,17 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rasnik.analysis.frame import Frame
-from rasnik.analysis.gauss_newton import Solution, invert, solve
+from rasnik.analysis.gauss_newton import SINGULAR, Solution, invert, scaled_eigenvalues, solve
 from rasnik.analysis.moments import all_tiles
 from rasnik.analysis.parameters import KURTOSIS_RANGE, Model, design
 from rasnik.imaging.appearance import Camera
 
 __all__ = [
     "DEMANDED_GAIN",
+    "LEAST_PIXELS",
     "demanded",
     "explained",
     "gain",
     "is_clean",
+    "is_determined",
     "makes_sense",
     "pose_covariance",
     "shears_needed",
@@ -24,6 +26,9 @@ __all__ = [
 
 #: Decrease of chi-square for which parameters are added to the fit of a clean image.
 DEMANDED_GAIN = 20.0
+
+#: Fewer pixels say nothing: ten for each of the parameters there can be.
+LEAST_PIXELS = 250
 
 _CLUSTER_TILES = 3
 
@@ -38,12 +43,23 @@ def shears_needed(solution: Solution) -> bool:
 
 
 def is_clean(solution: Solution) -> bool:
-    """No tile's chi-square stands out: 6 sigma above the noise, or above the median tile."""
+    """No tile's chi-square stands out: 6 sigma above the noise, or above the median tile.
+
+    Without a tile that is seen there is nothing to say so: not clean.
+    """
     counts = solution.moments.counts
     full = counts >= 32
+    if not full.any():
+        return False
     ratio = solution.moments.chi2_per_tile[full] / counts[full]
     limit = max(1.0, float(np.median(ratio))) * (1 + 6 * np.sqrt(2 / counts[full]))
     return bool((ratio < limit).all())
+
+
+def is_determined(solution: Solution) -> bool:
+    """Whether there are enough pixels, and in the right places, for every parameter."""
+    values = scaled_eigenvalues(solution.normal)
+    return bool(solution.moments.n_pixels >= LEAST_PIXELS and values[0] > SINGULAR * values[-1])
 
 
 def demanded(trial: Solution, camera: Camera) -> float:

@@ -13,11 +13,15 @@ from rasnik.analysis.parameters import N_LIGHT, POSE_SIZE, Model, State, design,
 from rasnik.imaging.kernels import TILE
 from rasnik.imaging.model import MIN_BLUR_PX, make_scene
 
-__all__ = ["Solution", "invert", "iterate", "solve"]
+__all__ = ["SINGULAR", "Solution", "invert", "iterate", "scaled_eigenvalues", "solve"]
 
 #: A step smaller than this at the corners of the image, in fields, is the last: what it
 #: leaves grows as its cube and is a few picometres for 85 um fields.
 LAST_STEP_FIELDS = 1.2e-3
+
+#: Relative eigenvalue (of the normal matrix with unit diagonal) below which a combination of
+#: parameters is not determined by the image.
+SINGULAR = 1e-9
 
 _MAX_STEP_FIELDS = 0.2
 _NEGLIGIBLE = 0.05
@@ -160,11 +164,17 @@ def _motion_fields(state: State, step: NDArray[np.float64], frame: Frame, n_pose
     return float((np.hypot(*step[:2]) + reach * turn) / frame.mask.field_um)
 
 
+def scaled_eigenvalues(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Eigenvalues of the normal matrix with unit diagonal, in rising order; zeros stay zero."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    return np.linalg.eigvalsh(normal * np.outer(scale, scale))
+
+
 def solve(normal: NDArray[np.float64], gradient: NDArray[np.float64]) -> NDArray[np.float64]:
     """Solve the normal equations, leaving out what the image does not determine."""
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     values, vectors = np.linalg.eigh(normal * np.outer(scale, scale))
-    inverse = np.where(values > 1e-9 * values[-1], 1 / np.maximum(values, 1e-300), 0.0)
+    inverse = np.where(values > SINGULAR * values[-1], 1 / np.maximum(values, 1e-300), 0.0)
     solution: NDArray[np.float64] = scale * (vectors @ (inverse * (vectors.T @ (scale * gradient))))
     return solution
 
@@ -172,6 +182,6 @@ def solve(normal: NDArray[np.float64], gradient: NDArray[np.float64]) -> NDArray
 def invert(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
     inverse: NDArray[np.float64] = np.linalg.pinv(
-        normal * np.outer(scale, scale), rcond=1e-9, hermitian=True
+        normal * np.outer(scale, scale), rcond=SINGULAR, hermitian=True
     ) * np.outer(scale, scale)
     return inverse

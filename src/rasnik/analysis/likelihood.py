@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 
 from rasnik.analysis.evidence import (
     DEMANDED_GAIN,
+    LEAST_PIXELS,
     demanded,
     explained,
     gain,
     is_clean,
+    is_determined,
     makes_sense,
     pose_covariance,
     shears_needed,
@@ -57,6 +59,7 @@ class Fit:
     valid : ndarray of uint8, shape (H, W)
         The pixels used.
     converged : bool
+        False also if the pixels used do not determine every parameter.
     clean : bool
         Whether no part of the image stands out of the others.
     explained : float
@@ -137,7 +140,13 @@ def fit(
     Returns
     -------
     Fit
+
+    Raises
+    ------
+    ValueError
+        If hardly a pixel can be used, or `start` is out of what can be modelled.
     """
+    _demand_pixels(frame)
     first = previous_chi2_ndf is None
     chosen: Model = "affine" if model == "auto" else model
     if model == "auto" and not first:
@@ -200,11 +209,17 @@ def _result(task: _Task, solution: Solution, clean: bool) -> Fit:
         chi2_ndf=solution.chi2_ndf,
         noise=task.noise,
         valid=task.frame.valid,
-        converged=solution.converged,
+        converged=solution.converged and is_determined(solution),
         clean=clean,
         explained=explained(task.frame, task.noise, solution.chi2_ndf),
         flags=flags,
     )
+
+
+def _demand_pixels(frame: Frame) -> None:
+    count = np.count_nonzero(frame.valid)
+    if count < LEAST_PIXELS:
+        raise ValueError(f"{count} pixels can be used, {LEAST_PIXELS} are needed")
 
 
 def _coarse_stride(shape: tuple[int, int]) -> int:
@@ -252,7 +267,9 @@ def _without_outliers(task: _Task, solution: Solution) -> tuple[_Task, Solution]
         frame, state = task.frame, solution.state
         valid = find_outliers(frame.image, allowed, state, frame.mask, frame.camera, frame.noise)
         changed = np.count_nonzero(valid != frame.valid)
-        task = replace(task, frame=replace(frame, valid=valid)).with_noise_at(state)
+        task = replace(task, frame=replace(frame, valid=valid))
+        _demand_pixels(task.frame)
+        task = task.with_noise_at(state)
         solution = task.run(state)
         if changed < 1e-3 * valid.size:
             break

@@ -162,7 +162,7 @@ def gather(
     """
     products, counts = tile_products(image, valid, scene, noise, tiles)
     basis, basis_products = _monomials(camera, tiles.tobytes())
-    if trim:
+    if trim and counts.any():
         ratio = products[:, _CHI2] / np.maximum(counts, 1)
         keep = ratio <= _TRIM * np.median(ratio[counts > 0])
         products, counts = products[keep], counts[keep]
