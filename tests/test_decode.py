@@ -134,7 +134,7 @@ def test_three_per_cent_wrong_fields_never_give_a_wrong_position(rng) -> None:
 
 @pytest.mark.parametrize("fields", [(2, 0), (0, 2), (-2, 2), (18, 0), (9, 81)])
 def test_a_torn_view_reads_as_one_of_its_parts_or_not_at_all(fields, rng) -> None:
-    """Two parts of one lattice that show the code in two places, as after a jump by whole fields."""
+    """Two parts of one lattice, whole fields apart on the mask."""
     unknown = 0
     for _ in range(60):
         seed, orientation = rng.integers(2**32), rng.integers(1, 5)

@@ -167,7 +167,8 @@ def _motion_fields(state: State, step: NDArray[np.float64], frame: Frame, n_pose
 def scaled_eigenvalues(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Eigenvalues of the normal matrix with unit diagonal, in rising order; zeros stay zero."""
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    return np.linalg.eigvalsh(normal * np.outer(scale, scale))
+    values: NDArray[np.float64] = np.linalg.eigvalsh(normal * np.outer(scale, scale))
+    return values
 
 
 def solve(normal: NDArray[np.float64], gradient: NDArray[np.float64]) -> NDArray[np.float64]:
