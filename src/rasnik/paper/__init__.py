@@ -1,1 +1,1 @@
-"""The figures and numbers of the paper, made again."""
+"""The figures and numbers of the paper, done again by this software."""
