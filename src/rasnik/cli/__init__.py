@@ -12,6 +12,7 @@ from rasnik.cli.demo import demo_command
 from rasnik.cli.design import design_command
 from rasnik.cli.export import export_command
 from rasnik.cli.mask import mask_command
+from rasnik.cli.noise import noise_command
 from rasnik.cli.predict import predict_command
 from rasnik.cli.simulate import simulate_command
 from rasnik.cli.systems import systems_command
@@ -57,4 +58,5 @@ app.command("demo")(demo_command)
 app.command("mask")(mask_command)
 app.command("predict")(predict_command)
 app.command("budget")(budget_command)
+app.command("noise")(noise_command)
 app.command("design")(design_command)
