@@ -11,9 +11,11 @@ from rasnik.cli.budget import budget_command
 from rasnik.cli.demo import demo_command
 from rasnik.cli.design import design_command
 from rasnik.cli.export import export_command
+from rasnik.cli.linearity import linearity_command
 from rasnik.cli.mask import mask_command
 from rasnik.cli.noise import noise_command
 from rasnik.cli.predict import predict_command
+from rasnik.cli.resolution import resolution_command
 from rasnik.cli.simulate import simulate_command
 from rasnik.cli.systems import systems_command
 from rasnik.cli.track import track_command
@@ -60,3 +62,5 @@ app.command("predict")(predict_command)
 app.command("budget")(budget_command)
 app.command("noise")(noise_command)
 app.command("design")(design_command)
+app.command("resolution")(resolution_command)
+app.command("linearity")(linearity_command)
