@@ -14,9 +14,11 @@ from rasnik.cli.export import export_command
 from rasnik.cli.linearity import linearity_command
 from rasnik.cli.mask import mask_command
 from rasnik.cli.noise import noise_command
+from rasnik.cli.paper import paper_command
 from rasnik.cli.predict import predict_command
 from rasnik.cli.resolution import resolution_command
 from rasnik.cli.simulate import simulate_command
+from rasnik.cli.spectrum import spectrum_command
 from rasnik.cli.systems import systems_command
 from rasnik.cli.track import track_command
 
@@ -64,3 +66,5 @@ app.command("noise")(noise_command)
 app.command("design")(design_command)
 app.command("resolution")(resolution_command)
 app.command("linearity")(linearity_command)
+app.command("paper")(paper_command)
+app.command("spectrum")(spectrum_command)

@@ -92,6 +92,7 @@ def write_all(folder: Path, results: Sequence[Result], made: str) -> dict[str, A
         "rows": [json_ready(asdict(row)) for row in rows],
         "failed": {result.name: result.error for result in results if result.error},
         "seconds": {result.name: round(result.seconds, 1) for result in results},
+        "processor_s": {result.name: round(result.processor_s, 1) for result in results},
     }
     text = json.dumps(document, indent=1, allow_nan=False)
     (folder / "results.json").write_text(text + "\n", encoding="utf-8")
