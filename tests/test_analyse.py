@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,9 @@ from PIL import Image
 
 from rasnik import Flag, Pose, Projection, System, analyse, load_system, simulate
 from rasnik.analysis.flags import FLAGS
+from rasnik.imaging.appearance import Appearance, Camera
+from rasnik.imaging.model import expected_image
+from rasnik.imaging.noise import ReadOut
 
 SMALL = load_system("solidras", ["sensor.width_px=300", "sensor.height_px=240"])
 POSE = (20_000.0, 30_000.0, 0.02)
@@ -161,6 +165,59 @@ def test_changed_blur_is_noticed_and_fitted_again() -> None:
     pose = analyse(frame_at(system=softer), SMALL, prior=before)
     assert_at(pose, *POSE[:2])
     assert pose.blur_um == pytest.approx(4.8, abs=0.02)
+
+
+@pytest.mark.parametrize("apart_um", [0.06, 3.0])
+def test_two_positions_in_one_frame_are_noticed(apart_um: float) -> None:
+    system = load_system("solidras", ["sensor.width_px=360", "sensor.height_px=270"])
+    poses = [POSE, (POSE[0] + apart_um, *POSE[1:])]
+    upper, lower = simulate(system, poses, seed=3).frames
+    torn = upper.copy()
+    torn[135:] = lower[135:]
+    for prior in (None, analyse(upper, system)):
+        pose = analyse(torn, system, prior=prior)
+        assert not pose.ok or pose.flags & Flag.MODEL_MISFIT
+        assert not pose.ok or pose.sigma_x_um > 1.3e-3
+
+
+def test_no_frame_is_suspected_for_its_noise() -> None:
+    frames = simulate(SMALL, [POSE] * 150, seed=8).frames
+    prior = analyse(frames[0], SMALL)
+    poses = [analyse(frame, SMALL, prior=prior) for frame in frames]
+    assert not any(pose.flags for pose in poses)
+    pulls = np.array([(pose.x_um - POSE[0]) / pose.sigma_x_um for pose in poses])
+    assert abs(pulls.std() - 1) < 4 / np.sqrt(2 * len(pulls))
+
+
+def test_the_map_of_a_bad_frame_does_not_outlast_it() -> None:
+    upper, lower, good = simulate(SMALL, [POSE, (20_000.2, *POSE[1:]), POSE], seed=4).frames
+    torn = upper.copy()
+    torn[120:] = lower[120:]
+    bad = analyse(torn, SMALL)
+    assert bad.ok and bad.model == "affine"
+    pose = analyse(good, SMALL, prior=bad)
+    assert pose.model == "similarity" and not pose.flags
+    assert_at(pose, *POSE[:2])
+
+
+def test_the_profile_of_a_prior_is_kept_only_where_it_is_seen() -> None:
+    good = frame_at()
+    plain = analyse(good, SMALL)
+    assert plain.appearance is not None
+    halo = replace(plain, appearance=plain.appearance.with_(kurtosis=0.15))
+    pose = analyse(good, SMALL, prior=halo)
+    assert not pose.flags & Flag.PROFILE_REFINED
+    assert pose.appearance is not None and pose.appearance.kurtosis == 0.0
+    # where it is seen it stays
+    assert plain.projection is not None
+    camera = Camera(SMALL.shape, SMALL.pitch_um)
+    edges = Appearance.uniform(25.0, 200.0, 6.0).with_(kurtosis=-0.4)
+    expected = expected_image(SMALL.mask, plain.projection, edges, camera).astype(float)
+    first, second = (ReadOut(expected, SMALL).frame(np.random.default_rng(seed)) for seed in (1, 2))
+    pose = analyse(second, SMALL, prior=analyse(first, SMALL))
+    assert pose.flags == Flag.PROFILE_REFINED
+    assert pose.appearance is not None
+    assert pose.appearance.kurtosis == pytest.approx(-0.4, abs=0.06)
 
 
 def test_a_prior_settles_an_ambiguous_view() -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
 from rasnik.analysis.frame import Frame
-from rasnik.analysis.gauss_newton import SINGULAR, Solution, invert, scaled_eigenvalues, solve
-from rasnik.analysis.moments import all_tiles
+from rasnik.analysis.gauss_newton import SINGULAR, Solution, scaled_eigenvalues, solve
+from rasnik.analysis.moments import N_MONOMIALS, all_tiles
 from rasnik.analysis.parameters import KURTOSIS_RANGE, Model, design
 from rasnik.imaging.appearance import Camera
 
@@ -19,8 +21,10 @@ __all__ = [
     "gain",
     "is_clean",
     "is_determined",
+    "is_needless",
     "makes_sense",
     "pose_covariance",
+    "scatter",
     "shears_needed",
 ]
 
@@ -31,15 +35,44 @@ DEMANDED_GAIN = 20.0
 LEAST_PIXELS = 250
 
 _CLUSTER_TILES = 3
+_CHANCE_SIGMAS = 6.0
 
 
 def shears_needed(solution: Solution) -> bool:
     """Whether the affine fit differs from a similarity by more than it can by chance."""
-    covariance = invert(solution.normal)[4:6, 4:6] * max(1.0, solution.chi2_ndf)
+    return _shear_evidence(solution, solution.inverse) > DEMANDED_GAIN
+
+
+def is_needless(solution: Solution, model: Model, kurtosis: bool) -> bool:
+    """Whether the image would hardly be described worse without the parameters added last.
+
+    Half of what it took to add them, so that they do not come and go from frame to frame.
+    """
+    inverse, state = solution.inverse, solution.state
+    evidence = [np.inf]
+    if model == "affine":
+        evidence.append(_shear_evidence(solution, inverse))
+    if model == "projective":
+        evidence.append(_evidence(state.projection.matrix[2, :2], solution, inverse[6:8, 6:8]))
+    if kurtosis:
+        cumulant = state.appearance.kurtosis * state.appearance.blur_um**4
+        evidence.append(_evidence(np.array([cumulant]), solution, inverse[-1:, -1:]))
+    return min(evidence) < DEMANDED_GAIN / 2
+
+
+def _shear_evidence(solution: Solution, inverse: NDArray[np.float64]) -> float:
     jacobian = solution.state.projection.jacobian
     gram = jacobian.T @ jacobian / np.trace(jacobian.T @ jacobian)
     shear = np.array([gram[0, 0] - gram[1, 1], 2 * gram[0, 1]]) / 2
-    return float(shear @ np.linalg.solve(covariance, shear)) > DEMANDED_GAIN
+    return _evidence(shear, solution, inverse[4:6, 4:6])
+
+
+def _evidence(
+    values: NDArray[np.float64], solution: Solution, inverse: NDArray[np.float64]
+) -> float:
+    """Chi-square of parameters against zero."""
+    covariance = inverse * max(1.0, solution.chi2_ndf)
+    return float(values @ np.linalg.solve(covariance, values))
 
 
 def is_clean(solution: Solution) -> bool:
@@ -68,7 +101,7 @@ def demanded(trial: Solution, camera: Camera) -> float:
     Dirt and distortion that are still there make it fall for no reason, the more so the more
     they scatter the parts of the image.
     """
-    growth = _scatter_growth(trial, invert(trial.normal), camera)
+    growth = scatter(trial, camera)[0]
     inflation = max(trial.chi2_ndf, float((growth**2).max()))
     return DEMANDED_GAIN + 3 * DEMANDED_GAIN * max(0.0, inflation - 1.5)
 
@@ -103,18 +136,17 @@ def gain(
     return float(total - (moments.chi2 - solution.chi2))
 
 
-def pose_covariance(solution: Solution, enlarge: bool, camera: Camera) -> NDArray[np.float64]:
-    """Covariance of x, y, S, theta_z from the information, and from the scatter if asked.
+def pose_covariance(
+    solution: Solution, growth: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Covariance of x, y, S, theta_z from the information, and from the scatter if given.
 
-    The scatter between clusters of tiles (48 x 48 pixels) counts what the noise law does
-    not: a wrong profile, dirt, distortion. The larger of both is taken per parameter.
+    The scatter between clusters of tiles counts what the noise law does not: a wrong
+    profile, dirt, distortion. The larger of it and of chi-square is taken per parameter.
     """
-    inverse = invert(solution.normal)
-    covariance = inverse[:4, :4].copy()
-    if enlarge:
-        growth = np.maximum(
-            np.sqrt(max(1.0, solution.chi2_ndf)), _scatter_growth(solution, inverse, camera)
-        )
+    covariance = solution.inverse[:4, :4].copy()
+    if growth is not None:
+        growth = np.maximum(np.sqrt(max(1.0, solution.chi2_ndf)), growth)
         covariance *= np.outer(growth, growth)
     scale = solution.state.projection.similarity()[0]
     unit = np.diag([1.0, 1.0, scale, 1.0])
@@ -122,24 +154,39 @@ def pose_covariance(solution: Solution, enlarge: bool, camera: Camera) -> NDArra
     return result
 
 
-def _scatter_growth(
-    solution: Solution, inverse: NDArray[np.float64], camera: Camera
-) -> NDArray[np.float64]:
+def scatter(solution: Solution, camera: Camera) -> tuple[NDArray[np.float64], float]:
     """Scatter of the pose between clusters of tiles, relative to what the noise explains.
+
+    Clusters of 48 x 48 pixels. Unlike chi-square it tells a noise law that is a little off
+    from parts of the image that show different positions.
 
     Returns
     -------
-    ndarray, shape (4,)
+    growth : ndarray, shape (4,)
+    by_chance : float
+        What it does not exceed by chance: of n clusters of normal noise its standard deviation is
+        1 / sqrt(2 n), a quarter more for scale and rotation, which the corners determine.
     """
-    cluster = all_tiles(camera.shape) // _CLUSTER_TILES
-    label = cluster[:, 0] * (cluster[:, 1].max() + 1) + cluster[:, 1]
-    gradient = solution.moments.per_tile @ solution.design.T
-    gradient -= gradient.mean(axis=0)
-    sums = np.zeros((label.max() + 1, gradient.shape[1]))
-    np.add.at(sums, label, gradient)
-    scatter = (inverse @ (sums.T @ sums) @ inverse)[:4, :4]
-    growth: NDArray[np.float64] = np.sqrt(np.diag(scatter) / np.diag(inverse)[:4])
-    return growth
+    moments, inverse = solution.moments, solution.inverse
+    label = _clusters(camera.shape)
+    weights = (inverse[:4] @ solution.design).reshape(-1, N_MONOMIALS)
+    by_signal = (weights @ moments.basis.T).reshape(4, -1, len(label))
+    influence = (by_signal * moments.projections.T).sum(axis=1)
+    influence -= influence.mean(axis=1, keepdims=True)
+    sums = np.stack([np.bincount(label, row) for row in influence])
+    variance = np.maximum(np.diag(inverse)[:4], 1e-300)  # zero where not determined
+    growth: NDArray[np.float64] = np.sqrt((sums**2).sum(axis=1) / variance)
+    pixels = np.bincount(label, moments.counts)
+    clusters = pixels.sum() ** 2 / (pixels**2).sum()
+    return growth, float(1 + _CHANCE_SIGMAS / np.sqrt(2 * clusters))
+
+
+@lru_cache(maxsize=8)
+def _clusters(shape: tuple[int, int]) -> NDArray[np.intp]:
+    """Number of the cluster that every tile belongs to."""
+    row, column = (all_tiles(shape) // _CLUSTER_TILES).T.astype(np.intp)
+    label: NDArray[np.intp] = row * (column.max() + 1) + column
+    return label
 
 
 def explained(frame: Frame, noise: tuple[float, float], chi2_ndf: float) -> float:

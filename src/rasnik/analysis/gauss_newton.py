@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ SINGULAR = 1e-9
 
 _MAX_STEP_FIELDS = 0.2
 _NEGLIGIBLE = 0.05
+_SETTLED = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,11 @@ class Solution:
     @property
     def ndf(self) -> int:
         return max(self.moments.n_pixels - len(self.normal), 1)
+
+    @cached_property
+    def inverse(self) -> NDArray[np.float64]:
+        """Covariance of the parameters that the noise explains."""
+        return invert(self.normal)
 
     @property
     def chi2_ndf(self) -> float:
@@ -129,7 +136,9 @@ def iterate(
             still,
         )
         variance = best_start.appearance.blur_um**2
-        if still and (fixed_shape or abs(step[n_pose + N_LIGHT]) < 0.02 * variance):
+        blur_settled = fixed_shape or abs(step[n_pose + N_LIGHT]) < _SETTLED * variance
+        edge_settled = fixed_shape or not kurtosis or abs(step[-1]) < _SETTLED * variance**2
+        if still and blur_settled and edge_settled:
             break
     assert best is not None
     return best
@@ -167,8 +176,7 @@ def _motion_fields(state: State, step: NDArray[np.float64], frame: Frame, n_pose
 def scaled_eigenvalues(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Eigenvalues of the normal matrix with unit diagonal, in rising order; zeros stay zero."""
     scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    values: NDArray[np.float64] = np.linalg.eigvalsh(normal * np.outer(scale, scale))
-    return values
+    return np.asarray(np.linalg.eigvalsh(normal * np.outer(scale, scale)), dtype=np.float64)
 
 
 def solve(normal: NDArray[np.float64], gradient: NDArray[np.float64]) -> NDArray[np.float64]:

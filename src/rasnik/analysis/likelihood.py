@@ -24,8 +24,10 @@ from rasnik.analysis.evidence import (
     gain,
     is_clean,
     is_determined,
+    is_needless,
     makes_sense,
     pose_covariance,
+    scatter,
     shears_needed,
 )
 from rasnik.analysis.flags import Flag
@@ -133,9 +135,9 @@ def fit(
         "auto" takes the simplest that the data allow.
     previous_chi2_ndf : float, optional
         Says that `start` is a previous result, and how well that one fitted. Its model and
-        edge profile are then kept; blur and edge shift are not fitted again as long as the
-        image is fitted as well with the old ones, which takes half the time. (The position
-        does not depend on them.) By default `start` is a first estimate.
+        its blur and edges are kept as long as the image is fitted as well with them and no
+        simpler model would do, which takes half the time. (The position does not depend on
+        blur and edges.) By default `start` is a first estimate.
 
     Returns
     -------
@@ -147,17 +149,17 @@ def fit(
         If hardly a pixel can be used, or `start` is out of what can be modelled.
     """
     _demand_pixels(frame)
-    first = previous_chi2_ndf is None
-    chosen: Model = "affine" if model == "auto" else model
-    if model == "auto" and not first:
-        chosen = _simplest(start.projection)
-    start = _restricted(start, chosen)
-    kurtosis = not first and start.appearance.kurtosis != 0.0
-    task = _Task(frame, frame.noise or (1.0, 0.0), chosen, kurtosis, first)
     if previous_chi2_ndf is not None and frame.noise is not None:
-        quick = _with_fixed_shape(task, start, model, previous_chi2_ndf)
+        kept = _simplest(start.projection) if model == "auto" else model
+        kurtosis = start.appearance.kurtosis != 0.0
+        task = _Task(frame, frame.noise, kept, kurtosis, False)
+        quick = _as_before(task, _restricted(start, kept), model, previous_chi2_ndf)
         if quick is not None:
             return _result(task, quick, clean=True)
+    chosen: Model = "affine" if model == "auto" else model
+    start = _restricted(start, chosen)
+    start = replace(start, appearance=replace(start.appearance, kurtosis=0.0))
+    task = _Task(frame, frame.noise or (1.0, 0.0), chosen, False, True)
     task = task.with_noise_at(start)
     coarse = task.run_coarse(start)
     if model == "auto" and chosen == "affine" and not shears_needed(coarse):
@@ -173,14 +175,18 @@ def fit(
     return _result(task, solution, clean)
 
 
-def _with_fixed_shape(
+def _as_before(
     task: _Task, start: State, model: Model | Literal["auto"], previous_chi2_ndf: float
 ) -> Solution | None:
-    """The solution with the previous blur and edges; None if it fits less well than then."""
-    solution = task.run(start, 1, fixed_shape=True)
+    """The solution with the previous blur and edges; None if another model is to be tried.
+
+    Whether a kurtosis is still needed can only be told by fitting it.
+    """
+    fixed = not task.kurtosis
+    solution = task.run(start, 1 if fixed else 3, fixed_shape=fixed)
     if not solution.converged:
-        coarse = task.run_coarse(solution.state, fixed_shape=True)
-        solution = task.run(coarse.state, 3, fixed_shape=True)
+        coarse = task.run_coarse(solution.state, fixed_shape=fixed)
+        solution = task.run(coarse.state, 3, fixed_shape=fixed)
     allowed = max(previous_chi2_ndf, 1.0) * 5 * np.sqrt(2 / solution.ndf)
     if not solution.converged or not solution.chi2_ndf < previous_chi2_ndf + allowed:
         return None
@@ -188,8 +194,10 @@ def _with_fixed_shape(
         return None
     if model == "auto" and task.model != "projective":
         richer: Model = "affine" if task.model == "similarity" else "projective"
-        if gain(task.frame, solution, richer, False, fixed_shape=True) > DEMANDED_GAIN:
+        if gain(task.frame, solution, richer, task.kurtosis, fixed_shape=fixed) > DEMANDED_GAIN:
             return None
+    if is_needless(solution, task.model if model == "auto" else "similarity", task.kurtosis):
+        return None
     return solution
 
 
@@ -199,13 +207,14 @@ def _result(task: _Task, solution: Solution, clean: bool) -> Fit:
         flags |= Flag.NOISE_ESTIMATED
     if task.kurtosis:
         flags |= Flag.PROFILE_REFINED
-    if solution.chi2_ndf > _MISFIT:
+    growth, by_chance = scatter(solution, task.frame.camera)
+    if solution.chi2_ndf > _MISFIT or not growth.max() < by_chance:
         flags |= Flag.MODEL_MISFIT
     enlarge = bool(flags & (Flag.MODEL_MISFIT | Flag.NOISE_ESTIMATED))
     return Fit(
         state=solution.state,
         model=task.model,
-        covariance=pose_covariance(solution, enlarge, task.frame.camera),
+        covariance=pose_covariance(solution, growth if enlarge else None),
         chi2_ndf=solution.chi2_ndf,
         noise=task.noise,
         valid=task.frame.valid,

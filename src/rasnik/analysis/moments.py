@@ -77,12 +77,6 @@ class Moments:
     def n_pixels(self) -> int:
         return int(self.counts.sum())
 
-    @property
-    def per_tile(self) -> NDArray[np.float64]:
-        """`vector` of every tile, shape (n, 42)."""
-        products = self.projections[:, :, None] * self.basis[:, None, :]
-        return products.reshape(len(self.basis), -1)
-
 
 @lru_cache(maxsize=8)
 def all_tiles(shape: tuple[int, int]) -> NDArray[np.int32]:
