@@ -39,21 +39,21 @@ class Part:
 
 #: In the order of the paper.
 PARTS: tuple[Part, ...] = (
-    Part("contour", "contour:contour", 8),
+    Part("contour", "contour:contour", 4),
     Part("chessfield", "pictures:chessfield", 1),
-    Part("pixel-noise", "pixel_noise:pixel_noise", 10),
+    Part("pixel-noise", "pixel_noise:pixel_noise", 8),
     Part("blur", "pictures:blur", 1),
     Part("exaggerated-noise", "pictures:exaggerated_noise", 1),
     Part("image-spectrum", "fourier_picture:image_spectrum", 2),
-    Part("scatter", "scatter:scatter", 20),
-    Part("linearity", "linearity:linearity", 40),
+    Part("scatter", "scatter:scatter", 33),
+    Part("linearity", "linearity:linearity", 60),
     Part("light-levels", "floors:light_levels", 110),
     Part("frame-rates", "floors:frame_rates", 85),
     Part("solidras-image", "pictures:solidras_image", 2),
-    Part("resolution", "resolution:resolution", 30),
+    Part("resolution", "resolution:resolution", 25),
     Part("solidras-uv", "floors:solidras_uv", 30),
     Part("microras", "floors:microras", 31),
-    Part("improvements", "improvements:steps", 60),
+    Part("improvements", "improvements:steps", 15),
 )
 
 
