@@ -155,7 +155,7 @@ def _rows(
             }
             rows.append(
                 Row(
-                    f"linearity, {1e3 * scan.theta_rad:g} mrad over {length}, {name}: largest",
+                    f"largest linearity error, {1e3 * scan.theta_rad:g} mrad, {length}, {name}",
                     "nm",
                     _PAPER[scan.theta_rad] if path == "paper" else "",
                     **values,

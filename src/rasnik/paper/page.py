@@ -67,7 +67,9 @@ footer { color: var(--soft); font-size: .85rem; margin-top: 3rem;
   body { max-width: none; padding: 0; font-size: 10.5pt; }
   h2 { break-after: avoid; } figure, tr { break-inside: avoid; }
   th { position: static; } .wide { overflow: visible; } table { font-size: 8pt; }
-  td, th { padding: .2rem .35rem; }
+  td, th { padding: .2rem .35rem; } p, li, figcaption { max-width: none; }
+  ol.notes { font-size: 8pt; } figure img { max-height: 9.5cm; width: auto; }
+  h2 { margin-top: 1.4rem; }
 }
 """
 

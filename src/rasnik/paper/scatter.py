@@ -170,7 +170,7 @@ def _rows(
         rows.append(
             Row(
                 f"nine positions: offset of the first, {name}", "nm", paper,
-                _mean(centre["fourier"], axis), _mean(centre["likelihood"], axis), Value(0.0),
+                _mean(centre["fourier"], axis), _mean(centre["likelihood"], axis), None,
                 "Fourier on the paper's generator, likelihood on the exact one. The fit of "
                 f"images of the paper's generator is off by ({own[0]:+.1f}, {own[1]:+.1f}) nm "
                 "too: hard-edged points within the pixel and a blur sampled on the pixel grid "
