@@ -26,7 +26,7 @@ _LEAST_BINS = 24  # in a band
 _LEAST_BANDS = 3  # that agree, for a floor to be one
 _SLOPE_BANDS = 8  # from which a remainder can be fitted too
 _QUANTILE = 0.2  # of the bands, from where the flat part is looked for
-_MARGIN = 2  # bands left out beside those that do not agree
+_BANDS_PER_MARGIN = 24  # one band is left out beside those that do not agree for so many
 _CUT = 3.0  # standard deviations by which a band may differ
 
 
@@ -167,8 +167,9 @@ def _flat(levels: NDArray[np.float64], relative: NDArray[np.float64]) -> NDArray
         if not agree.any() or (agree == before).all():
             break
         level = float(np.average(levels[agree], weights=relative[agree] ** -2))
-    padded = np.pad(agree, _MARGIN, constant_values=True)
-    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * _MARGIN + 1).all(1))
+    margin = len(levels) // _BANDS_PER_MARGIN
+    padded = np.pad(agree, margin, constant_values=True)
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(padded, 2 * margin + 1).all(1))
 
 
 def _fit(

@@ -1,7 +1,8 @@
 """Spectra of frames at irregular times, by the periodogram of Lomb and Scargle.
 
 A sinusoid is fitted at each frequency, so no value is invented between the frames; but what is
-faster than half of the mean rate is folded in as in an even series, only blurred. Windows are
+faster than half of the mean rate is folded in as in an even series, only blurred; and a strong line
+raises all around it, by as much as the times are irregular. Windows are
 those of Welch's method, Hann's and half overlapping in time; on even times the result is that of
 `rasnik.characterisation.spectrum.welch`.
 

@@ -185,7 +185,8 @@ def window_length(
     ----------
     series : Series
     windows : int, optional
-        Number of windows, half overlapping, that frames without gaps are divided into.
+        Number of windows, half overlapping, that frames without gaps are divided into; as near
+        as windows of an even number of frames come to it.
     length_s : float, optional
         Length of a window instead. By default there are `WINDOWS` windows, or more if gaps do
         not leave half of the frames in unbroken stretches of that length.

@@ -13,8 +13,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from rasnik.characterisation.lines import Line
 from rasnik.characterisation.spectrum import Coherence
 from rasnik.characterisation.track_spectrum import TrackSpectrum
+from rasnik.report.numbers import rounded, with_sigma
 
 __all__ = ["plot_spectra", "shown_unit", "spectra_figure"]
 
@@ -119,7 +121,7 @@ def spectra_figure(
 def _style(k: int) -> dict[str, Any]:
     return {
         "color": _COLOURS[k % len(_COLOURS)],
-        "linestyle": _DASHES[k // len(_COLOURS) % len(_DASHES)],
+        "linestyle": _DASHES[k % len(_DASHES)],
     }
 
 
@@ -139,7 +141,7 @@ def _draw_spectra(
 ) -> None:
     typical = [one.floor.asd if one.floor else float(np.median(one.spectrum.asd)) for _, one in own]
     unit, factor = shown_unit(own[0][1].spectrum.unit, min(typical))
-    bounds: dict[float, str] = {}
+    bounds: dict[float, float] = {}
     lowest = math.inf
     for k, one in own:
         frequency_hz, asd = one.spectrum.frequency_hz, one.spectrum.asd
@@ -151,7 +153,7 @@ def _draw_spectra(
         if one.floor is not None:
             value, sigma = one.floor.asd * factor, one.floor.sigma * factor
             label += (
-                f": floor {value:.4g} ± {sigma:.1g} {_rthz(unit)}, "
+                f": floor {with_sigma(value, sigma)} {_rthz(unit)}, "
                 f"{one.floor.low_hz:.3g} to {one.floor.high_hz:.4g} Hz "
                 f"(sigma/√f: {one.floor.as_paper * factor:.4g})"
             )
@@ -162,11 +164,11 @@ def _draw_spectra(
         axes.plot(low, high, linewidth=0.9, label=label, **_style(k))
         lowest = min(lowest, float(np.quantile(asd[inside], 0.01)) * factor)
         if math.isfinite(one.bound):
-            bounds.setdefault(float(f"{one.bound_asd * factor:.3g}"), unit)
-    for value in bounds:
+            bounds.setdefault(float(f"{one.bound_asd * factor:.3g}"), one.spectrum.rate_hz)
+    for value, rate_hz in bounds.items():
         axes.axhline(
             value, color="black", linestyle=":", linewidth=1.3,
-            label=f"Cramer-Rao bound {value:g} {_rthz(unit)}",
+            label=f"Cramer-Rao bound at {rate_hz:g} frames/s: {value:g} {_rthz(unit)}",
         )  # fmt: skip
         lowest = min(lowest, value)
     axes.set_xscale("log")
@@ -203,24 +205,28 @@ def _name_lines(axes: Axes, own: list[tuple[int, TrackSpectrum]], factor: float)
         if any(abs(math.log(line.frequency_hz / other)) < 0.03 for other in named):
             continue
         named.append(line.frequency_hz)
-        near = np.searchsorted(one.spectrum.frequency_hz, [line.low_hz, line.high_hz])
-        top = float(one.spectrum.asd[near[0] : near[1] + 1].max()) * factor
-        text = f"{line.frequency_hz:.4g} Hz"
+        tops = [_highest(other, line) for _, other in own]
+        text = f"{float(rounded(line.frequency_hz, one.spectrum.resolution_hz / 5, 1)):g} Hz"
         if line.name:
             text += " mains" + ("\n(alias)" if line.name.startswith("alias") else "")
         axes.annotate(
-            text, (line.frequency_hz, top), xytext=(0, 4), textcoords="offset points",
-            fontsize=7.5, rotation=90, ha="center", va="bottom",
+            text, (line.frequency_hz, max(tops) * factor), xytext=(0, 4),
+            textcoords="offset points", fontsize=7.5, rotation=90, ha="center", va="bottom",
         )  # fmt: skip
-    if named:  # room for the names
-        bottom, top = axes.get_ylim()
-        axes.set_ylim(bottom, top * (top / bottom) ** 0.45)
+    bottom, top = axes.get_ylim()  # room for the names, or for the legend
+    axes.set_ylim(bottom, top * (top / bottom) ** 0.45 if named else 5 * top)
+
+
+def _highest(one: TrackSpectrum, line: Line) -> float:
+    """Of a spectrum near a line; 0 where it does not reach."""
+    frequency_hz = one.spectrum.frequency_hz
+    reach_hz = 3 * one.spectrum.resolution_hz
+    near = (frequency_hz >= line.low_hz - reach_hz) & (frequency_hz <= line.high_hz + reach_hz)
+    return float(one.spectrum.asd[near].max(initial=0.0))
 
 
 def _draw_rms(axes: Axes, own: list[tuple[int, TrackSpectrum]]) -> None:
-    unit, factor = shown_unit(
-        own[0][1].spectrum.unit, max(float(one.spectrum.cumulative_rms[-2]) for _, one in own)
-    )
+    unit, factor = shown_unit(own[0][1].spectrum.unit, max(one.spectrum.rms() for _, one in own))
     for k, one in own:
         spectrum = one.spectrum
         inside = spectrum.frequency_hz > 0
@@ -244,7 +250,7 @@ def _draw_allan(axes: Axes, own: list[tuple[int, TrackSpectrum]]) -> None:
         axes.set_axis_off()
         return
     unit, factor = shown_unit(
-        own[0][1].spectrum.unit, min(float(found.deviation.min()) for _, found, _ in shown)
+        own[0][1].spectrum.unit, max(float(found.deviation.max()) for _, found, _ in shown)
     )
     for k, found, one in shown:
         axes.errorbar(
