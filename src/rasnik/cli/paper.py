@@ -72,7 +72,7 @@ def paper_command(
     except ValueError as error:
         fail(f"{error}.")
     seconds = time.perf_counter() - start
-    made = made_by(effort, seconds)
+    made = made_by(effort, seconds, only or ())
     document = write_all(folder, results, made)
     if as_json:
         typer.echo(json.dumps(document, indent=1))

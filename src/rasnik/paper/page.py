@@ -74,11 +74,12 @@ footer { color: var(--soft); font-size: .85rem; margin-top: 3rem;
 """
 
 
-def made_by(effort: Effort, seconds: float) -> str:
+def made_by(effort: Effort, seconds: float, only: Iterable[str] = ()) -> str:
     """Command, software, machine and duration of a run, in one line."""
-    quick = " --quick" if effort.quick else ""
+    options = (" --quick" if effort.quick else "") + f" --seed {effort.seed}"
+    options += "".join(f" --only {name}" for name in only)
     return (
-        f"rasnik paper{quick} --seed {effort.seed}: rasnik {__version__}, numpy {np.__version__}, "
+        f"rasnik paper{options}: rasnik {__version__}, numpy {np.__version__}, "
         f"Python {platform.python_version()}, {os.cpu_count()} processor cores, "
         f"{date.today().isoformat()}, {seconds:.0f} s"
     )

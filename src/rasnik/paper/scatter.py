@@ -87,7 +87,9 @@ def scatter(effort: Effort) -> Outcome:
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     _draw(left, clouds, "paper", "fourier", "Fourier analysis, the paper's generator")
     _draw(right, clouds, "exact", "likelihood", "likelihood fit, exact generator")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    figure.legend(
+        *left.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False
+    )
     caption = (
         f"Output for {count} images at each of nine positions on a grid of 10 nm from (4000, "
         "5000) µm, with the pixel fluctuations of SolidRas and with a quarter of them. Both "
@@ -175,7 +177,7 @@ def _rows(
                 f"images of the paper's generator is off by ({own[0]:+.1f}, {own[1]:+.1f}) nm "
                 "too: hard-edged points within the pixel and a blur sampled on the pixel grid "
                 "move the contours of an image that is not rotated, so this offset is the "
-                "generator's.",
+                "generator's. The paper does not state theta_z of this figure; 0 is taken.",
             )
         )  # fmt: skip
     return tuple(rows)
