@@ -10,6 +10,7 @@ from rasnik.cli.analyse import analyse_command
 from rasnik.cli.budget import budget_command
 from rasnik.cli.demo import demo_command
 from rasnik.cli.design import design_command
+from rasnik.cli.edges import edges_command
 from rasnik.cli.export import export_command
 from rasnik.cli.linearity import linearity_command
 from rasnik.cli.mask import mask_command
@@ -64,6 +65,7 @@ app.command("predict")(predict_command)
 app.command("budget")(budget_command)
 app.command("noise")(noise_command)
 app.command("design")(design_command)
+app.command("edges")(edges_command)
 app.command("resolution")(resolution_command)
 app.command("linearity")(linearity_command)
 app.command("paper")(paper_command)

@@ -10,7 +10,7 @@ import typer
 
 from rasnik.cli.common import fail, load, numbers
 
-__all__ = ["Method", "Model", "analyse_command"]
+__all__ = ["Method", "Model", "analyse_command", "check_instrument", "parse_bounds"]
 
 _INSTRUMENT, _ANALYSIS, _OUTPUT = "Instrument", "Analysis", "Output"
 _ORIENTATIONS = {"auto": None, "1": 1, "2": 2, "3": 3, "4": 4}
@@ -144,10 +144,10 @@ def analyse_command(
         fail("--json, --csv and -o exclude each other; give one of them.")
     if orientation not in _ORIENTATIONS:
         fail(f"--orientation {orientation!r} is not known; give auto, 1, 2, 3 or 4.")
-    _check_instrument(system, settings, field_um, pixel_um)
+    check_instrument(system, settings, field_um, pixel_um)
     if method is Method.FOURIER and model not in (Model.AUTO, Model.SIMILARITY):
         fail(f"--method fourier knows only the similarity; leave out --model {model.value}.")
-    edges = _parse_bounds(bounds) if bounds is not None else None
+    edges = parse_bounds(bounds) if bounds is not None else None
     instrument = load(system, settings or ()) if system is not None else None
 
     from rasnik.cli.batch import Destination, Options, run_batch
@@ -168,7 +168,7 @@ def analyse_command(
     raise typer.Exit(0 if all_good else 1)
 
 
-def _check_instrument(
+def check_instrument(
     system: str | None, settings: list[str] | None, field_um: float | None, pixel_um: float | None
 ) -> None:
     """The instrument is described once, and in full."""
@@ -192,7 +192,8 @@ def _check_instrument(
             fail(f"{name} must be between {least:g} and {most:g} um, not {value:g}.")
 
 
-def _parse_bounds(text: str) -> tuple[int, int, int, int]:
+def parse_bounds(text: str) -> tuple[int, int, int, int]:
+    """(left, top, right, bottom) from the text of ``--bounds``, or the end of the command."""
     values = numbers(text, "--bounds", "left,top,right,bottom", 4)
     if any(value != int(value) if abs(value) < 1e9 else True for value in values):
         fail(f"--bounds {text!r} must be whole numbers of pixels.")

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 _MOST_CANDIDATES = 4
 
-__all__ = ["Destination", "Options", "run_batch"]
+__all__ = ["Destination", "Options", "run_batch", "system_of"]
 
 _COUNTED_SOURCES = 200  # with more, opening each only to count its frames takes too long
 
@@ -200,7 +200,7 @@ class _Overlays:
         from rasnik.report.overlay import draw_overlay
 
         assert frame.image is not None
-        system = self._options.system or _system_of(frame, self._options)
+        system = self._options.system or system_of(frame, self._options)
         title = f"{frame.file}, frame {frame.frame}"
         try:
             draw_overlay(
@@ -227,7 +227,7 @@ class _Overlays:
         return self._folder / f"{unique}.png"
 
 
-def _system_of(frame: Frame, options: Options) -> System:
+def system_of(frame: Frame, options: Options) -> System:
     """A system with the image's own size, for field and pixel sizes alone."""
     from rasnik.instrument import Optics, Sensor, System
     from rasnik.mask import ChessField
