@@ -300,6 +300,18 @@ def test_half_of_a_frame_is_older(small: System, frames: Callable[..., list[Imag
     assert not track.flags[5:].any()
 
 
+def test_more_freedom_than_needed_is_given_up(
+    small: System, frames: Callable[..., list[Image]]
+) -> None:
+    """Frames whose halves differ call for an affine map; those after them do not."""
+    old, new = frames(*[0.0] * 6), frames(*[0.06] * 120, seed=2)
+    torn = [np.vstack([a[:135], b[135:]]) for a, b in zip(new, old, strict=False)]
+    track = Tracker(small).run([*old[:2], *torn, *new])
+    affine = (track.flags & Flag.AFFINE) > 0
+    assert affine[2:8].any() and not affine[-20:].any()
+    assert (np.abs(track.x_um[-20:] - POSE[0] - 0.06) < 5 * track.sigma_x_um[-20:]).all()
+
+
 def test_numbers_and_times(small: System, frames: Callable[..., list[Image]]) -> None:
     images = frames(*[0.0] * 8)
     number = [0, 1, 2, 5, 6, 7, 8, 9]

@@ -117,7 +117,13 @@ class Builder:
         return last == self.tiles
 
     def finish(self) -> Linearisation:
-        """The linearisation, once all tiles are done."""
+        """The linearisation, once all tiles are done.
+
+        Raises
+        ------
+        ValueError
+            If the reference is so far out that its signals are not finite.
+        """
         assert self._next == self.tiles
         settings, state = self.settings, self.state
         kept = self.weights.shape[1] - 1
@@ -131,6 +137,8 @@ class Builder:
         rounding = _products(coarse, self.rounding)
         kept_rows = shaped[:, :kept].reshape(len(rows), -1)
         response = rows @ mixed @ rows.T + kept_rows @ rounding @ kept_rows.T
+        if not np.isfinite(response).all():
+            raise ValueError("the reference is out of what the image model can describe")
         gain, covariance = _solve(response, rows @ plain @ rows.T, n_model)
         matrix = np.matmul(gain @ shaped[:, :kept].transpose(1, 0, 2), coarse.T)  # (s, k, t)
         n_pose = POSE_SIZE[settings.model]

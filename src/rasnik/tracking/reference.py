@@ -45,6 +45,7 @@ _MISFIT = 1.15
 _MISFIT_DRIFT = 0.1
 _CURVATURE = 0.1
 _SURPRISE = 45.0
+_SCALE_CHANGE = 0.05
 _COARSE_STRIDE = 13  # tiles; shares no factor with their usual number in a row
 _AVERAGED = 64  # frames over which the chi-square that is expected follows the one seen
 
@@ -337,7 +338,14 @@ def approach(frame: Frame, settings: Settings, state: State) -> State | None:
         )  # fmt: skip
     except ValueError:  # a state that cannot be modelled
         return None
-    return found.state if found.converged else None
+    return found.state if found.converged and _sane(state, found.state) else None
+
+
+def _sane(start: State, found: State) -> bool:
+    """Whether a state is still the same instrument: a few per cent of scale, some contrast."""
+    before, after = (state.projection.similarity()[0] for state in (start, found))
+    light, dark = found.appearance.light[0], found.appearance.dark[0]
+    return bool(abs(np.log(after / before)) < _SCALE_CHANGE and np.isfinite(light) and light > dark)
 
 
 def build(settings: Settings, state: State) -> Linearisation:

@@ -49,6 +49,8 @@ _SOON = 32  # frames; a reference that lasts as long need not be set ahead
 _NO_OTHER = 20  # times the range of a reference: guesses so close lead to the same place
 _PATIENCE = 3  # frames with something in the way before that is taken as lasting
 _MORE_MASKED = 5e-4
+_ASKED_AFTER = 32  # frames until a richer model is reconsidered for the first time
+_RICH = Flag.AFFINE | Flag.PROJECTIVE | Flag.PROFILE_REFINED
 _MOST_AT_ONCE = 64  # frames
 _AS_STORED = ("uint8", "uint16", "float32")
 
@@ -102,6 +104,7 @@ class Tracker:
         self._builder: Builder | None = None
         self._motion = Motion()
         self._began_at = np.zeros(4)  # the step when the reference came into use
+        self._ask_after, self._ask_at = _ASKED_AFTER, 0.0  # frames, whether less would do
         self._odd = 0  # frames in a row that a fit explained less well
         self._at_once = _MOST_AT_ONCE
         self._arrivals = Arrivals()
@@ -143,6 +146,7 @@ class Tracker:
             return self._recover(grey, reading, arrival)
         self._accept(reference, reading, [self._arrivals.clock])
         self._work_ahead(reference, reading)
+        self._reconsider(grey)
         return reference.pose(reading, arrival)
 
     def blocks(
@@ -272,6 +276,7 @@ class Tracker:
         self._accept(reference, reading, clock)
         if not near[n - 1]:
             self._follow(reference, reading[n - 1 :])
+        self._reconsider(batch[n - 1])
         return n
 
     def _accept(self, reference: Reference, reading: Reading, clock: list[float]) -> None:
@@ -327,9 +332,28 @@ class Tracker:
             self._builder = None
             here = reference.vector + reading.steps[0, :4]
             there = vector_of(builder.state, reference.origin.orientation)
-            if _distance(here - there) < _distance(reading.steps[0, :4]):
+            if not _distance(here - there) < _distance(reading.steps[0, :4]):
+                return
+            try:
                 self._reference = reference.moved_to(builder.finish())
-                self.references += 1
+            except ValueError:
+                return
+            self.references += 1
+
+    def _reconsider(self, grey: Image) -> None:
+        """Whether a simpler map or profile would do again, asked more and more seldom.
+
+        A frame that was not a view of one mask may have called for more freedom than needed.
+        """
+        reference = self._reference
+        if reference is None or not reference.flags & _RICH or self._ask_at > self._arrivals.clock:
+            return
+        self._ask_after *= 2
+        self._ask_at = self._arrivals.clock + self._ask_after
+        pose = analyse(grey, prior=self._expected(), **self._options)
+        given_up = (reference.flags & _RICH) & ~pose.flags
+        if pose.ok and given_up and not pose.flags & (Flag.PRIOR_REJECTED | Flag.HEAVILY_MASKED):
+            self._begin(grey, pose)
 
     # ----------------------------------------------------------------- frames that do not fit
 
@@ -381,7 +405,10 @@ class Tracker:
         near = approach(self._prepared(grey), settings, state)
         if near is None:
             return None
-        moved = reference.moved_to(build(settings, near))
+        try:
+            moved = reference.moved_to(build(settings, near))
+        except ValueError:
+            return None
         self.references += 1
         reading = moved.read([grey])
         good = moved.usable(reading)[0] and moved.explains(reading)[0]
@@ -425,6 +452,7 @@ class Tracker:
         self._reference = self._last[0]
         self.references += 1
         self._odd = 0
+        self._ask_after, self._ask_at = _ASKED_AFTER, self._arrivals.clock + _ASKED_AFTER
         self._motion.add(self._arrivals.clock, self._reference.vector)
 
     def _prepared(self, grey: Image) -> Frame:
