@@ -446,14 +446,19 @@ class Tracker:
         return replace(pose, flags=flags)
 
     def _begin(self, grey: Image, pose: Pose) -> None:
-        """Track from a full fit on."""
+        """Track from a full fit on, if a linearisation about it finds the same."""
         free = self._options["model"] == "auto"
-        self._last = Reference.from_fit(self._prepared(grey), pose, free)
-        self._reference = self._last[0]
+        try:
+            reference, reading = Reference.from_fit(self._prepared(grey), pose, free)
+        except ValueError:  # a pose at the edge of what can be modelled
+            return
         self.references += 1
+        if not reference.usable(reading)[0]:
+            return
+        self._reference, self._last = reference, (reference, reading)
         self._odd = 0
         self._ask_after, self._ask_at = _ASKED_AFTER, self._arrivals.clock + _ASKED_AFTER
-        self._motion.add(self._arrivals.clock, self._reference.vector)
+        self._motion.add(self._arrivals.clock, reference.vector)
 
     def _prepared(self, grey: Image) -> Frame:
         bounds = self._options["bounds"]
