@@ -338,3 +338,16 @@ def test_every_flag_is_explained() -> None:
     assert {info.flag for info in FLAGS} == {flag for flag in Flag if flag}
     for info in FLAGS:
         assert info.sentence.endswith(".") and info.remedy.endswith(".")
+
+
+def test_a_prior_some_way_off_is_no_misfit() -> None:
+    """What the last step has still to take out of the residuals is not scatter between parts."""
+    system = load_system("solidras", {"sensor.width_px": 360, "sensor.height_px": 270})
+    poses = [(4000.0 + 0.03 * k, 5000.0 - 0.02 * k, 0.002 + 5e-6 * k) for k in range(6)]
+    first, *others = simulate(system, poses, seed=4).frames
+    prior = analyse(first, system)
+    for frame in others:
+        pose = analyse(frame, system, prior=prior)
+        assert pose.ok and not pose.flags
+        alone = analyse(frame, system)
+        np.testing.assert_allclose(np.diag(pose.covariance), np.diag(alone.covariance), rtol=0.01)

@@ -171,7 +171,8 @@ def scatter(solution: Solution, camera: Camera) -> tuple[NDArray[np.float64], fl
     label = _clusters(camera.shape)
     weights = (inverse[:4] @ solution.design).reshape(-1, N_MONOMIALS)
     by_signal = (weights @ moments.basis.T).reshape(4, -1, len(label))
-    influence = (by_signal * moments.projections.T).sum(axis=1)
+    left = moments.projections_after(solution.step @ solution.design)
+    influence = (by_signal * left.T).sum(axis=1)
     influence -= influence.mean(axis=1, keepdims=True)
     sums = np.stack([np.bincount(label, row) for row in influence])
     variance = np.maximum(np.diag(inverse)[:4], 1e-300)  # zero where not determined

@@ -63,6 +63,8 @@ class Moments:
         Projections of every tile's residual on the signals.
     basis : ndarray, shape (n, 6)
         Monomials at the centres of the tiles.
+    products : ndarray, shape (n, 28)
+        Products of the signals of every tile, the upper triangle row by row.
     """
 
     matrix: NDArray[np.float64]
@@ -72,6 +74,14 @@ class Moments:
     counts: NDArray[np.float64]
     projections: NDArray[np.float64]
     basis: NDArray[np.float64]
+    products: NDArray[np.float64]
+
+    def projections_after(self, change: NDArray[np.float64]) -> NDArray[np.float64]:
+        """`projections` once the (signal, monomial) pairs, shape (42,), have changed."""
+        amplitude = self.basis @ change.reshape(_N, N_MONOMIALS).T
+        grams = self.products[:, symmetric_index(_N)].reshape(-1, _N, _N)
+        after: NDArray[np.float64] = self.projections - (grams @ amplitude[:, :, None])[:, :, 0]
+        return after
 
     @property
     def n_pixels(self) -> int:
@@ -161,7 +171,8 @@ def gather(
         keep = ratio <= _TRIM * np.median(ratio[counts > 0])
         products, counts = products[keep], counts[keep]
         basis, basis_products = basis[keep], basis_products[keep]
-    packed = products[:, _SIGNAL_PAIRS].T @ basis_products
+    pairs = products[:, _SIGNAL_PAIRS]
+    packed = pairs.T @ basis_products
     blocks = packed[_EXPAND].reshape(_N, _N, N_MONOMIALS, N_MONOMIALS)
     size = _N * N_MONOMIALS
     projections = products[:, _RESIDUAL_PAIRS]
@@ -174,4 +185,5 @@ def gather(
         counts,
         projections,
         basis,
+        pairs,
     )

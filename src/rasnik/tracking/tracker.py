@@ -49,8 +49,15 @@ _SOON = 32  # frames; a reference that lasts as long need not be set ahead
 _NO_OTHER = 20  # times the range of a reference: guesses so close lead to the same place
 _PATIENCE = 3  # frames with something in the way before that is taken as lasting
 _MORE_MASKED = 5e-4
-_ASKED_AFTER = 32  # frames until a richer model is reconsidered for the first time
-_RICH = Flag.AFFINE | Flag.PROJECTIVE | Flag.PROFILE_REFINED
+_ASKED_AFTER = 32  # frames until such things are reconsidered for the first time
+_PASSING = (  # what a frame may have called for that later ones do not
+    Flag.AFFINE
+    | Flag.PROJECTIVE
+    | Flag.PROFILE_REFINED
+    | Flag.MODEL_MISFIT
+    | Flag.HEAVILY_MASKED
+    | Flag.SATURATED
+)
 _MOST_AT_ONCE = 64  # frames
 _AS_STORED = ("uint8", "uint16", "float32")
 
@@ -341,18 +348,23 @@ class Tracker:
             self.references += 1
 
     def _reconsider(self, grey: Image) -> None:
-        """Whether a simpler map or profile would do again, asked more and more seldom.
+        """Whether a full fit would find less amiss now, asked more and more seldom.
 
-        A frame that was not a view of one mask may have called for more freedom than needed.
+        A frame that was not a clean view of one mask may have called for more freedom, or for
+        more pixels to be left out, than is needed later.
         """
         reference = self._reference
-        if reference is None or not reference.flags & _RICH or self._ask_at > self._arrivals.clock:
+        if (
+            reference is None
+            or not reference.flags & _PASSING
+            or self._ask_at > self._arrivals.clock
+        ):
             return
         self._ask_after *= 2
         self._ask_at = self._arrivals.clock + self._ask_after
         pose = analyse(grey, prior=self._expected(), **self._options)
-        given_up = (reference.flags & _RICH) & ~pose.flags
-        if pose.ok and given_up and not pose.flags & (Flag.PRIOR_REJECTED | Flag.HEAVILY_MASKED):
+        given_up = (reference.flags & _PASSING) & ~pose.flags
+        if pose.ok and given_up and not pose.flags & Flag.PRIOR_REJECTED:
             self._begin(grey, pose)
 
     # ----------------------------------------------------------------- frames that do not fit
