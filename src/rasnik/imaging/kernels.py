@@ -277,8 +277,8 @@ def one_corner(work, index, corners, width, origin, orders):
 def many_corners(work, index, flat, width, origin, reach, orders):
     """The same where a pixel feels several corners: sums over the fields within reach."""
     sides = 2 * reach
-    weights(work, EX, WX, reach, orders)
-    weights(work, EY, WY, reach, orders)
+    for axis in range(2):
+        weights(work, EX + axis * (EY - EX), WX + axis * (WY - WX), reach, orders)
     for sy in range(sides):
         for sx in range(sides):
             for lane in range(LANES):
@@ -356,38 +356,36 @@ def edge_densities(work, reach):
 
 
 @_compiled
-def pattern(work, index, scene, u, v, columns, rows):
-    """Blurred mask and derivatives for the tile whose first pixel is at sensor point (u, v)."""
-    reach, orders = scene.reach, scene.orders
-    locate(work, index, scene.map, u, v, scene.pixel_um, columns, rows)
-    profiles(work, index, DX, EX, scene.table_x, scene.limit_x, scene.step_x, reach, orders)
-    profiles(work, index, DY, EY, scene.table_y, scene.limit_y, scene.step_y, reach, orders)
-    width = np.int32(scene.fields.shape[1])
-    origin = np.int32(scene.j0 * scene.fields.shape[1] + scene.i0)
-    if reach == 1:
-        one_corner(work, index, scene.corners.ravel(), width, origin, orders)
-    else:
-        many_corners(work, index, scene.fields.ravel(), width, origin, reach, orders)
-
-
-@_compiled
 def signals(work, index, scene, row0, column0, rows, columns):
     """Expected grey level and its derivatives for a tile of rows x columns pixels."""
-    subpixels = scene.subpixels
+    reach, orders, subpixels, pixel = scene.reach, scene.orders, scene.subpixels, scene.pixel_um
+    width = np.int32(scene.fields.shape[1])
+    origin = np.int32(scene.j0 * scene.fields.shape[1] + scene.i0)
     for a in range(N_SIGNALS + 1):
         for lane in range(LANES):
             work[a, lane] = np.float32(0.0)
-    u_first = scene.axes[0] + column0 * scene.pixel_um
-    v_first = scene.axes[1] + row0 * scene.pixel_um
+    u_first = scene.axes[0] + column0 * pixel
+    v_first = scene.axes[1] + row0 * pixel
     for part_v in range(subpixels):
-        v = v_first + ((part_v + 0.5) / subpixels - 0.5) * scene.pixel_um
+        v = v_first + ((part_v + 0.5) / subpixels - 0.5) * pixel
         for part_u in range(subpixels):
-            u = u_first + ((part_u + 0.5) / subpixels - 0.5) * scene.pixel_um
-            pattern(work, index, scene, u, v, columns, rows)
-            add_part(work, scene.shape, np.float32(1.0 / (subpixels * subpixels)), scene.orders)
+            u = u_first + ((part_u + 0.5) / subpixels - 0.5) * pixel
+            locate(work, index, scene.map, u, v, pixel, columns, rows)
+            # one call for both axes: for a constant argument a function is compiled by itself
+            for axis in range(2):
+                table = scene.table_x if axis == 0 else scene.table_y
+                limit = scene.limit_x if axis == 0 else scene.limit_y
+                step = scene.step_x if axis == 0 else scene.step_y
+                to = EX + axis * (EY - EX)
+                profiles(work, index, DX + axis, to, table, limit, step, reach, orders)
+            if reach == 1:
+                one_corner(work, index, scene.corners.ravel(), width, origin, orders)
+            else:
+                many_corners(work, index, scene.fields.ravel(), width, origin, reach, orders)
+            add_part(work, scene.shape, np.float32(1.0 / (subpixels * subpixels)), orders)
     for row in range(TILE):
-        v = v_first + row * scene.pixel_um
-        grey_levels(work, scene.photometry, scene.axes, scene.pixel_um, u_first, v, row * TILE)
+        v = v_first + row * pixel
+        grey_levels(work, scene.photometry, scene.axes, pixel, u_first, v, row * TILE)
 
 
 @_compiled

@@ -241,5 +241,6 @@ def tile_products(
         Pixels used.
     """
     floor = max(noise[0], 1e-3 * noise[1] * float(np.ptp(scene.photometry[:, 0])), 1e-12)
+    tiles = np.ascontiguousarray(tiles)  # for any other layout the kernel is compiled again
     packed = kernels.gram(image, valid, tiles, np.array([*noise, floor]), scene)
     return packed[:, :-1], packed[:, -1]

@@ -17,7 +17,7 @@ from numba import njit
 
 from rasnik.imaging.kernels import LEVEL, ROOT, STRIDE, TILE, WORK_ROWS, signals
 
-__all__ = ["N_STATISTICS", "estimate", "store"]
+__all__ = ["N_STATISTICS", "estimate", "store", "sum_frame"]
 
 # What `estimate` tells beside the step.
 CHI2, EXPECTED, WORST_TILE, MOTION, CONTRAST, POSE_ENERGY, SURPRISE = range(7)
@@ -200,8 +200,20 @@ def _energy(residual, weights, start, size):
 
 
 @_careful
-def _sum_frame(frame, parts, level, weights, scales, sums, energies):
-    """Residuals times signals, and their weighted squares, summed over each tile."""
+def sum_frame(frame, parts, level, weights, scales, sums, energies):
+    """Residuals times signals, and their weighted squares, summed over each tile.
+
+    It stands apart from `estimate` because it is compiled for every type of grey levels.
+
+    Parameters
+    ----------
+    frame : shape (H, W)
+        Grey levels of any type.
+    parts, level, weights, scales
+        As made by `store`.
+    sums : float64, shape (tiles, signals)
+    energies : float64, shape (tiles,)
+    """
     height, width = frame.shape
     kept = weights.shape[1]
     wide = TILE * parts
@@ -325,17 +337,15 @@ def _refine(
 
 @_careful
 def estimate(
-    frame, parts, level, weights, scales, matrix, n_pose, lever, basis, contrast, units,
-    curvature, grams, within, counts, noise_slope, limits, negligible, step, statistics,
+    sums, energies, matrix, n_pose, lever, basis, contrast, units, curvature, grams, within,
+    counts, noise_slope, limits, negligible, step, statistics,
 ):  # fmt: skip
     """The step from the reference to a frame, and how well that explains it.
 
     Parameters
     ----------
-    frame : shape (H, W)
-        Grey levels of any type.
-    parts, level, weights, scales, counts
-        As made by `store`.
+    sums, energies
+        As made by `sum_frame`.
     matrix : float32, shape (parameters + extra, tiles * signals)
         From sums over tiles to the step; the extra rows yield what other parameters would
         explain, in sigma.
@@ -354,6 +364,8 @@ def estimate(
         Products of the signals.
     within : float64, shape (n_pose, n_pose)
         Information on the pose that lies within the tiles.
+    counts
+        As made by `store`.
     noise_slope : float
         B of the variance A + B g.
     limits : float64, shape (tiles,)
@@ -367,12 +379,9 @@ def estimate(
         chi-square by the pose; what the extra rows yield, squared and summed.
     """
     tiles, kept = grams.shape[0], grams.shape[1]
-    sums = np.empty((tiles, kept))
     beyond = np.empty((tiles, kept))
-    energies = np.empty(tiles)
     amplitude = np.zeros(kept)
     excess = np.zeros(kept)
-    _sum_frame(frame, parts, level, weights, scales, sums, energies)
     _apply(matrix, sums, step)
     _refine(
         step, matrix, n_pose, lever, basis, contrast, units, curvature, grams, negligible,

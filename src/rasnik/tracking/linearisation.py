@@ -352,11 +352,12 @@ class Linearisation:
         statistics : ndarray of float64, shape (kernels.N_STATISTICS,)
             Receives what `kernels.estimate` tells.
         """
+        sums, energies = np.empty(self.grams.shape[:2]), np.empty(len(self.grams))
+        kernels.sum_frame(frame, self.parts, self.level, self.weights, self.scales, sums, energies)
         kernels.estimate(
-            frame, self.parts, self.level, self.weights, self.scales, self.matrix,
-            POSE_SIZE[self.settings.model], self.lever, self.basis, self.contrast, self.units,
-            self.curvature, self.grams, self.within, self.counts, self.settings.noise[1],
-            self.limits, self._negligible, step, statistics,
+            sums, energies, self.matrix, POSE_SIZE[self.settings.model], self.lever, self.basis,
+            self.contrast, self.units, self.curvature, self.grams, self.within, self.counts,
+            self.settings.noise[1], self.limits, self._negligible, step, statistics,
         )  # fmt: skip
 
     @cached_property
