@@ -205,7 +205,7 @@ def test_a_stream_is_tracked_like_a_sequence(
     shifts = 0.006 * np.arange(120)
     images = frames(*shifts)
     tracker = Tracker(small)
-    poses = [tracker.update(image) for image in images]
+    poses = [tracker.update(image, k / 275) for k, image in enumerate(images)]
     assert tracker.references >= 3, "made while the stream went on"
     assert not any(pose.flags for pose in poses[1:])
     track = Tracker(small).run(images)

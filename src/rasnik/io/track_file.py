@@ -42,9 +42,9 @@ def track_metadata(system: System | None, metadata: Mapping[str, str] | None) ->
 class TrackWriter:
     """Writes a track into an HDF5 file while it is measured.
 
-    A context manager. The layout is told in `rasnik.io.track_table`. Others can read the file at any time, with `rasnik.io.read_track`. What
-    is written is in the file, for the case that this program is killed, within `flush_s`,
-    whether or not more follows.
+    A context manager. The layout is told in `rasnik.io.track_table`. Others can read the file
+    at any time, with `rasnik.io.read_track`. What is written is in the file, for the case that
+    this program is killed, within `flush_s`, whether or not more follows.
 
     Parameters
     ----------

@@ -19,13 +19,15 @@ class Arrivals:
     ----------
     clock : float
         Frames since the beginning, those that were lost included.
+    period_s : float
+        Mean time between frames; NaN if it is not known.
     """
 
     def __init__(self) -> None:
         self.clock = 0.0
         self._number = -1
         self._time_s = float("nan")
-        self._period_s = float("nan")
+        self.period_s = float("nan")
 
     def add(self, time_s: float | None, number: int | None) -> Flag:
         """Take note of a frame; the flags say whether it follows the one before.
@@ -56,8 +58,8 @@ class Arrivals:
         if elapsed_s <= 0:
             return Flag.TIME_IRREGULAR
         period = elapsed_s / frames
-        if np.isnan(self._period_s):
-            self._period_s = period
-        usual = _SHORTEST < period / self._period_s < _LONGEST
-        self._period_s += (min(period, 2 * self._period_s) - self._period_s) / _PERIODS
+        if np.isnan(self.period_s):
+            self.period_s = period
+        usual = _SHORTEST < period / self.period_s < _LONGEST
+        self.period_s += (min(period, 2 * self.period_s) - self.period_s) / _PERIODS
         return Flag.NONE if usual else Flag.TIME_IRREGULAR

@@ -34,6 +34,8 @@ from rasnik.tracking import kernels
 
 __all__ = ["Builder", "Linearisation", "Settings"]
 
+Matrix = NDArray[np.float64]
+
 TILE = model_kernels.TILE
 _TILES_ACROSS = 9
 _N = model_kernels.N_SIGNALS - 1
@@ -105,6 +107,12 @@ class Builder:
         self.rounding = np.zeros((self.tiles, kept, kept))
         self.counts = np.zeros((self.tiles, 3))
         self._next = 0
+        self._solved: tuple[Matrix, Matrix, Matrix, int] | None = None
+
+    @property
+    def solved(self) -> bool:
+        """Whether only `finish` is left."""
+        return self._solved is not None
 
     def advance(self, tiles: int | None = None) -> bool:
         """Work on the next tiles, all of the rest by default; True when nothing is left."""
@@ -116,8 +124,8 @@ class Builder:
         self._next = last
         return last == self.tiles
 
-    def finish(self) -> Linearisation:
-        """The linearisation, once all tiles are done.
+    def solve(self) -> None:
+        """Once all tiles are done: from their sums to the estimator. `finish` does it if need be.
 
         Raises
         ------
@@ -125,7 +133,6 @@ class Builder:
             If the reference is so far out that its signals are not finite.
         """
         assert self._next == self.tiles
-        settings, state = self.settings, self.state
         kept = self.weights.shape[1] - 1
         coarse, fine = self._bases()
         rows, n_model = self._parameters()
@@ -139,7 +146,25 @@ class Builder:
         response = rows @ mixed @ rows.T + kept_rows @ rounding @ kept_rows.T
         if not np.isfinite(response).all():
             raise ValueError("the reference is out of what the image model can describe")
-        gain, covariance = _solve(response, rows @ plain @ rows.T, n_model)
+        self._solved = (*_solve(response, rows @ plain @ rows.T, n_model), rows, n_model)
+
+    def finish(self) -> Linearisation:
+        """The linearisation, once all tiles are done.
+
+        Raises
+        ------
+        ValueError
+            As `solve`.
+        """
+        if self._solved is None:
+            self.solve()
+        assert self._solved is not None
+        gain, covariance, rows, n_model = self._solved
+        settings, state = self.settings, self.state
+        kept = self.weights.shape[1] - 1
+        coarse, fine = self._bases()
+        shaped = rows.reshape(len(rows), _N, N_MONOMIALS)
+        whole = self.products.sum(axis=1)
         matrix = np.matmul(gain @ shaped[:, :kept].transpose(1, 0, 2), coarse.T)  # (s, k, t)
         n_pose = POSE_SIZE[settings.model]
         within = self._within(rows[:n_pose], coarse, fine)

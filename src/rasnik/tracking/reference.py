@@ -17,6 +17,7 @@ from rasnik.analysis.moments import all_tiles
 from rasnik.analysis.outliers import estimate_noise, find_outliers
 from rasnik.analysis.parameters import POSE_SIZE, Model, State
 from rasnik.analysis.pose import Pose
+from rasnik.imaging.projection import wrap_angle
 from rasnik.tracking import kernels
 from rasnik.tracking.linearisation import Builder, Linearisation, Settings
 
@@ -29,7 +30,6 @@ __all__ = [
     "approach",
     "build",
     "model_of",
-    "vector_of",
 ]
 
 #: Motions in units of the edge width: where a new reference is wanted, and how far the present
@@ -245,14 +245,14 @@ class Reference:
 
     # ----------------------------------------------------------------- results
 
-    @property
+    @cached_property
     def flags(self) -> Flag:
         return self.origin.flags & _LASTING
 
     @cached_property
     def vector(self) -> NDArray[np.float64]:
         """(x, y, ln S, theta) of the reference, shape (4,)."""
-        return vector_of(self.linear.state, self.origin.orientation)
+        return _vector_of(self.linear.state, self.origin.orientation)
 
     @cached_property
     def _covariance(self) -> NDArray[np.float64]:
@@ -281,7 +281,7 @@ class Reference:
             "x_um": x + steps[0],
             "y_um": y + steps[1],
             "scale": np.exp(log_scale + steps[2]),
-            "theta_rad": (theta + steps[3] + np.pi) % (2 * np.pi) - np.pi,
+            "theta_rad": np.pi - (np.pi - theta - steps[3]) % (2 * np.pi),
             "sigma_x_um": sigma[0] * factor,
             "sigma_y_um": sigma[1] * factor,
             "sigma_scale": sigma[2] * factor,
@@ -300,21 +300,33 @@ class Reference:
 
     def pose(self, reading: Reading, flags: Flag = Flag.NONE) -> Pose:
         """The pose in one frame that fits."""
-        state = self.linear.stepped(reading.steps[0])
-        values: dict[str, Any] = {
-            name: float(np.ravel(v)[0]) for name, v in self.columns(reading).items()
-        }
+        step = reading.steps[0]
+        state = self.linear.stepped(step)
+        x, y, log_scale, theta = self.vector + step[:4]
         growth = self.growth * self._noise_factor(reading)[0]
-        covariance = self._covariance * np.outer(growth, growth)
-        return replace(
-            self.origin,
-            **{name: value for name, value in values.items() if not name.startswith("sigma")},
-            covariance=covariance,
-            flags=self.flags | flags,
-            edge_shift_um=state.appearance.edge_shift_um,
+        appearance = state.appearance
+        return Pose(
+            ok=True,
+            x_um=float(x),
+            y_um=float(y),
+            scale=float(np.exp(log_scale)),
+            theta_rad=wrap_angle(theta),
+            orientation=self.origin.orientation,
+            covariance=self._covariance * growth * growth[:, None],
+            chi2_ndf=float(self._chi2_ndf(reading)[0]),
+            blur_um=appearance.blur_um,
+            dark_level=float(appearance.dark[0]),
+            light_level=float(appearance.light[0]),
+            edge_shift_um=appearance.edge_shift_um,
+            polarity=self.origin.polarity,
+            code_lines_read=self.origin.code_lines_read,
+            code_lines_in_view=self.origin.code_lines_in_view,
             masked_fraction=1 - self.linear.n_pixels / self.linear.level.size,
+            flags=self.flags | flags,
             projection=state.projection,
-            appearance=state.appearance,
+            appearance=appearance,
+            method=self.origin.method,
+            model=self.origin.model,
         )
 
 
@@ -360,7 +372,7 @@ def model_of(pose: Pose) -> Model:
     return pose.model
 
 
-def vector_of(state: State, orientation: int) -> NDArray[np.float64]:
+def _vector_of(state: State, orientation: int) -> NDArray[np.float64]:
     """(x, y, ln S, theta) of a state, shape (4,)."""
     scale, theta, _ = state.projection.similarity(orientation)
     return np.array([state.projection.x_um, state.projection.y_um, np.log(scale), theta])

@@ -36,7 +36,6 @@ from rasnik.tracking.reference import (
     approach,
     build,
     model_of,
-    vector_of,
 )
 from rasnik.tracking.track import POSE_COLUMNS, TRACK_COLUMNS, Track
 
@@ -44,7 +43,8 @@ __all__ = ["Tracker"]
 
 Image = NDArray[Any]
 
-_SLICES = 24  # frames over which a new reference is made in a stream
+_SLICES = 48  # frames over which a new reference is made in a stream of unknown rate
+_BUILT_IN_S = 0.08  # and the time it may take if the rate is known
 _SOON = 32  # frames; a reference that lasts as long need not be set ahead
 _NO_OTHER = 20  # times the range of a reference: guesses so close lead to the same place
 _PATIENCE = 3  # frames with something in the way before that is taken as lasting
@@ -331,21 +331,33 @@ class Tracker:
         if builder is None:
             if not reference.near(reading)[0]:
                 try:
-                    state = self._ahead(reference, reading, _SLICES)
+                    state = self._ahead(reference, reading, self._slices())
                     self._builder = Builder(reference.linear.settings, state)
                 except ValueError:
                     return
-        elif builder.advance(-(-builder.tiles // _SLICES)):
+            return
+        if not builder.advance(-(-builder.tiles // self._slices())):
+            return
+        try:
+            if not builder.solved:  # that is work enough for one frame
+                builder.solve()
+                return
+            linear = builder.finish()
+        except ValueError:
             self._builder = None
-            here = reference.vector + reading.steps[0, :4]
-            there = vector_of(builder.state, reference.origin.orientation)
-            if not _distance(here - there) < _distance(reading.steps[0, :4]):
-                return
-            try:
-                self._reference = reference.moved_to(builder.finish())
-            except ValueError:
-                return
+            return
+        self._builder = None
+        moved = reference.moved_to(linear)
+        if _distance(reference.vector + reading.steps[0, :4] - moved.vector) < _distance(
+            reading.steps[0, :4]
+        ):
+            self._reference = moved
             self.references += 1
+
+    def _slices(self) -> int:
+        """Over how many frames a new reference is made: some hundredths of a second."""
+        period = self._arrivals.period_s
+        return _SLICES if np.isnan(period) else int(np.clip(_BUILT_IN_S / period, 16, 128))
 
     def _reconsider(self, grey: Image) -> None:
         """Whether a full fit would find less amiss now, asked more and more seldom.
