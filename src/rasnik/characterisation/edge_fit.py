@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 Sparse = Any  # scipy.sparse.csr_array, which has no types
 
 _KNOTS_PER_SIGMA = 2.5
+_KNOTS_PER_PIXEL = 2.5
+_ALONE_SIGMAS = 3.0
 _LEAST_KNOTS = 7  # between a contour and the half way to the next
 _LEAST_LENGTH_PX = 10.0
 _LENGTH_SIGMAS = 10.0
@@ -43,6 +45,7 @@ _KURTOSIS_PRIOR = 2.0
 _BLUR_RANGE = (1 / 4, 4.0)  # of the model's
 _LEAST_PIXELS_PER_COEFFICIENT = 4
 _SINGULAR = 1e-12
+_LEAST_STEP = 0.2  # of the black-white step
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,16 +163,14 @@ def make_equations(pixels: EdgePixels) -> Equations:
     ValueError
         If there are too few pixels.
     """
-    pixels = pixels.select(pixels.clear)
     pitch = pixels.camera.pixel_um
-    lengths, spacings, centres, columns = [], [], [], []
-    for kind in range(N_KINDS):
+    lengths = [_half_length(pixels.edges[kind // 2], pitch) for kind in range(N_KINDS)]
+    pixels = pixels.select(pixels.clear & _near(pixels, lengths))
+    spacings, centres, columns = [], [], []
+    for kind, length in enumerate(lengths):
         edge = pixels.edges[kind // 2]
-        length = max(_LENGTH_SIGMAS * edge.sigma_um, _LEAST_LENGTH_PX * pitch)
-        length = min(edge.field_um / 2, length)
-        spacing = length / max(_LEAST_KNOTS, np.ceil(_KNOTS_PER_SIGMA * length / edge.sigma_um))
+        spacing = length / np.ceil(_knots(edge, length, pitch))
         reach = int(np.ceil(max(length, 1.3 * edge.table.reach) / spacing))
-        lengths.append(length)
         spacings.append(spacing)
         centres.append(np.arange(-reach, reach + 1))
         columns.append(_columns(pixels, kind, spacing, centres[-1]))
@@ -198,6 +199,31 @@ def make_equations(pixels: EdgePixels) -> Equations:
         levels=inner @ cross,
         level_start=inner @ score,
     )
+
+
+def _half_length(edge: ModelEdge, pixel_um: float) -> float:
+    """How far a profile is followed, um: at most half way to the next contour."""
+    return min(edge.field_um / 2, max(_LENGTH_SIGMAS * edge.sigma_um, _LEAST_LENGTH_PX * pixel_um))
+
+
+def _knots(edge: ModelEdge, length_um: float, pixel_um: float) -> float:
+    """Between a contour and the end of its profile."""
+    count = max(_LEAST_KNOTS, _KNOTS_PER_SIGMA * length_um / edge.sigma_um)
+    if length_um > _ALONE_SIGMAS * edge.sigma_um:  # a contour alone: fringes are resolved
+        count = max(count, _KNOTS_PER_PIXEL * length_um / pixel_um)
+    return count
+
+
+def _near(pixels: EdgePixels, lengths: list[float]) -> NDArray[np.bool_]:
+    """Pixels that see a contour within the length of its profile.
+
+    The others are in the middle of fields of one colour side by side. Left out, they cannot set
+    the levels: these are those about the contours, whatever haze lies over the image.
+    """
+    near = np.zeros(len(pixels), dtype=bool)
+    for one in pixels.contours:
+        near |= (np.abs(one.distance_um) <= lengths[one.kind]) & (one.step > _LEAST_STEP)
+    return near
 
 
 def _splines(spacing: float, centres: NDArray[np.int64], distance_um: Array) -> Sparse:

@@ -37,6 +37,7 @@ __all__ = ["EdgeProfile", "Edges", "Estimate", "edges", "mean_edges"]
 Array = NDArray[np.float64]
 
 _BINS_PER_PIXEL = 8
+_LEVEL_PART = 0.8
 _AXES = ("x", "y")
 
 
@@ -112,6 +113,10 @@ class Edges:
         Chi-square per degree of freedom, cause by cause.
     chi2_ndf : float
         Of the image model, as stated with the pose.
+    levelled : float
+        Rise of the profiles over the middle 80 % of their length, mean: below 1 where the edge
+        goes on beyond the half way to the next contour, by blur or by haze. The transfer then
+        rests on the model's tails, and ripples where these do not join.
     noise_known : bool
         Whether chi-square refers to the system's noise; else to that where the image is flat.
     """
@@ -131,6 +136,7 @@ class Edges:
     blur_map: BlurMap
     causes: tuple[Cause, ...]
     chi2_ndf: float
+    levelled: float
     noise_known: bool
 
     @property
@@ -145,6 +151,7 @@ class Edges:
             "pixel_um": self.pixel_um,
             "scale": self.scale,
             "chi2_ndf": self.chi2_ndf,
+            "levelled": self.levelled,
             "noise_known": self.noise_known,
         }
         for name, one in self.numbers.items():
@@ -221,12 +228,13 @@ def edges(
     curves, shapes = fit_curves(equations), fit_shapes(equations)
     scale = pixels.scale
     ones = np.ones(N_KINDS)
+    profiles = tuple(_profile(equations, curves, shapes, kind) for kind in range(N_KINDS))
     x, y = np.array([1.0, 1, 0, 0]), np.array([0, 0, 1.0, 1])
     return Edges(
         images=1,
         pixel_um=pixels.camera.pixel_um,
         scale=scale,
-        profiles=tuple(_profile(equations, curves, shapes, kind) for kind in range(N_KINDS)),
+        profiles=profiles,
         blur_um=_mean(shapes, 1, ones),
         kurtosis=_mean(shapes, 2, ones),
         blur_x_um=_mean(shapes, 1, x),
@@ -241,6 +249,7 @@ def edges(
         blur_map=blur_map(equations, shapes),
         causes=explain(equations, curves),
         chi2_ndf=pose.chi2_ndf,
+        levelled=float(np.mean([_rise(one) for one in profiles])),
         noise_known=pixels.noise_known,
     )
 
@@ -256,6 +265,12 @@ def _combined(shapes: Shapes, column: int, weights: Array) -> Estimate:
         float(weights @ shapes.parameters[:, column]),
         float(np.sqrt(weights @ covariance @ weights)),
     )
+
+
+def _rise(one: EdgeProfile) -> float:
+    """How much a profile rises over the middle of its length."""
+    cut = round((1 - _LEVEL_PART) / 2 * len(one.value))
+    return float(one.value[-1 - cut] - one.value[cut])
 
 
 def _scaled(one: Estimate, factor: float) -> Estimate:
@@ -350,6 +365,7 @@ def mean_edges(several: Sequence[Edges]) -> Edges:
             for k, one in enumerate(first.causes)
         ),
         chi2_ndf=float(np.mean([one.chi2_ndf for one in several])),
+        levelled=float(np.mean([one.levelled for one in several])),
         noise_known=all(one.noise_known for one in several),
     )
 

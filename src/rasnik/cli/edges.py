@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 __all__ = ["edges_command"]
 
+_LEVELLED = 0.97  # of the step from black to white
+
 _LABELS = {
     "blur_um": ("blur, all contours", "µm on the sensor"),
     "blur_x_um": ("blur across x", "µm on the sensor"),
@@ -314,3 +316,9 @@ def _print(found: Edges, focus: dict[str, Any] | None, count: int) -> None:
         size = f"{cause.rms:.3g}" if cause.rms > 0 else ""
         steps.add_row(cause.name, str(cause.parameters or ""), f"{cause.chi2_ndf:.4f}", size)
     console.print(steps)
+    if found.levelled < _LEVELLED:
+        console.print(
+            f"Half way to the next contour the edges have risen to {found.levelled:.0%} only: blur "
+            "or haze reaches farther, and the modulation transfer rests on the model's tails.",
+            style="yellow",
+        )
