@@ -206,7 +206,7 @@ def test_a_stream_is_tracked_like_a_sequence(
     images = frames(*shifts)
     tracker = Tracker(small)
     poses = [tracker.update(image, k / 275) for k, image in enumerate(images)]
-    assert tracker.references >= 3, "made while the stream went on"
+    assert tracker.references >= 2, "made while the stream went on"
     assert not any(pose.flags for pose in poses[1:])
     track = Tracker(small).run(images)
     streamed = Track.from_poses(poses)

@@ -43,8 +43,8 @@ __all__ = ["Tracker"]
 
 Image = NDArray[Any]
 
-_SLICES = 48  # frames over which a new reference is made in a stream of unknown rate
-_BUILT_IN_S = 0.08  # and the time it may take if the rate is known
+_SLICES = 32  # parts in which a new reference is made in a stream
+_BREATH_S = 5e-3  # time between them, so that a fast stream catches up
 _SOON = 32  # frames; a reference that lasts as long need not be set ahead
 _NO_OTHER = 20  # times the range of a reference: guesses so close lead to the same place
 _PATIENCE = 3  # frames with something in the way before that is taken as lasting
@@ -329,14 +329,17 @@ class Tracker:
         """A part of the work on a new reference, in a stream that must not wait."""
         builder = self._builder
         if builder is None:
-            if not reference.near(reading)[0]:
+            # early, as the mask moves on while the work is done
+            if not reference.near(reading)[0] or reference.motion(reading)[0] > NEAR / 2:
                 try:
-                    state = self._ahead(reference, reading, self._slices())
+                    state = self._ahead(reference, reading, _SLICES * self._pause())
                     self._builder = Builder(reference.linear.settings, state)
                 except ValueError:
                     return
             return
-        if not builder.advance(-(-builder.tiles // self._slices())):
+        if self._arrivals.clock % self._pause():
+            return
+        if not builder.advance(-(-builder.tiles // _SLICES)):
             return
         try:
             if not builder.solved:  # that is work enough for one frame
@@ -354,10 +357,10 @@ class Tracker:
             self._reference = moved
             self.references += 1
 
-    def _slices(self) -> int:
-        """Over how many frames a new reference is made: some hundredths of a second."""
+    def _pause(self) -> int:
+        """Every how many frames some of a new reference is made: each at 275 Hz, 4th at 860."""
         period = self._arrivals.period_s
-        return _SLICES if np.isnan(period) else int(np.clip(_BUILT_IN_S / period, 16, 128))
+        return 1 if np.isnan(period) else max(1, round(_BREATH_S / period))
 
     def _reconsider(self, grey: Image) -> None:
         """Whether a full fit would find less amiss now, asked more and more seldom.
