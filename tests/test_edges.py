@@ -8,13 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 from PIL import Image
 from typer.testing import CliRunner
 
 from rasnik import Pose, Track, analyse, load_system, simulate
 from rasnik.characterisation.edge_contours import KINDS, ModelEdge, edge_pixels
 from rasnik.characterisation.edge_fit import fit_curves, fit_shapes, make_equations
-from rasnik.characterisation.edges import Edges, edges, mean_edges
+from rasnik.characterisation.edge_mean import mean_edges
+from rasnik.characterisation.edges import Edges, edges
 from rasnik.characterisation.focus import focus, focus_of_track
 from rasnik.cli import app
 from rasnik.imaging.appearance import Appearance, Camera
@@ -79,6 +81,11 @@ def test_profile_is_the_folded_gaussian_at_every_distance(gaussian: Edges) -> No
         seen = np.isfinite(one.binned)
         assert seen.all()
         np.testing.assert_allclose(one.binned, true(one.distance_um), atol=5e-4)
+        # the line spread of a Gaussian folded with the pixel, which hardly turned is one box
+        low, high = (one.distance_um + d * PIXEL_UM / 2 for d in (-1, 1))
+        step = scipy.stats.norm.cdf(high / BLUR_UM) - scipy.stats.norm.cdf(low / BLUR_UM)
+        np.testing.assert_allclose(one.line, step / PIXEL_UM, atol=2e-3 / PIXEL_UM)
+        assert (one.line_sigma > 0).any()
 
 
 @pytest.mark.parametrize("noise_known", [True, False], ids=["noise known", "noise measured"])

@@ -9,8 +9,7 @@ black to white and back.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,12 +31,13 @@ from rasnik.characterisation.edge_transfer import Transfer, edge_transfer
 from rasnik.characterisation.focus import BlurMap, blur_map
 from rasnik.instrument import System
 
-__all__ = ["EdgeProfile", "Edges", "Estimate", "edges", "mean_edges"]
+__all__ = ["CURVES", "NUMBERS", "EdgeProfile", "Edges", "Estimate", "edges"]
 
 Array = NDArray[np.float64]
 
 _BINS_PER_PIXEL = 8
 _LEVEL_PART = 0.8
+_SLOPE_STEP = 0.25  # of a bin, for slopes
 _AXES = ("x", "y")
 
 
@@ -66,6 +66,8 @@ class EdgeProfile:
         independent. NaN where no pixel lies.
     model : ndarray, shape (d,)
         The fitted image model.
+    line, line_sigma : ndarray, shape (d,)
+        Line spread: slope of the free curve, 1/um, and its error.
     shift_um : Estimate
         How far black reaches beyond the contour, on the sensor.
     blur_um : Estimate
@@ -81,6 +83,8 @@ class EdgeProfile:
     binned: Array
     binned_sigma: Array
     model: Array
+    line: Array
+    line_sigma: Array
     shift_um: Estimate
     blur_um: Estimate
     kurtosis: Estimate
@@ -142,7 +146,7 @@ class Edges:
     @property
     def numbers(self) -> dict[str, Estimate]:
         """The single numbers by name."""
-        return {name: getattr(self, name) for name in _NUMBERS}
+        return {name: getattr(self, name) for name in NUMBERS}
 
     def as_dict(self) -> dict[str, Any]:
         """Everything by name, for JSON; None where there is no value."""
@@ -165,7 +169,19 @@ class Edges:
         return found
 
 
-_NUMBERS = (
+#: Names of the arrays of a profile.
+CURVES = (
+    "distance_um",
+    "value",
+    "sigma",
+    "binned",
+    "binned_sigma",
+    "model",
+    "line",
+    "line_sigma",
+)
+#: Names of the single numbers of an image.
+NUMBERS = (
     "blur_um",
     "blur_x_um",
     "blur_y_um",
@@ -185,7 +201,7 @@ def _profile_dict(one: EdgeProfile) -> dict[str, Any]:
     for name in ("shift_um", "blur_um", "kurtosis"):
         estimate = getattr(one, name)
         found[name], found[f"sigma_{name}"] = estimate.value, estimate.sigma
-    for name in ("distance_um", "value", "sigma", "binned", "binned_sigma", "model"):
+    for name in CURVES:
         found[name] = [_finite(float(x)) for x in getattr(one, name)]
     return found
 
@@ -287,7 +303,14 @@ def _profile(equations: Equations, curves: Curves, shapes: Shapes, kind: int) ->
     basis = equations.basis(kind, distance)
     model = edge(distance)
     value = model + basis @ curves.coefficients[part]
-    variance = np.einsum("dm,mn,dn->d", basis, curves.covariance[part, part], basis)
+    ends = (distance - _SLOPE_STEP * step, distance + _SLOPE_STEP * step)
+    low, high = (equations.basis(kind, end) for end in ends)
+    slope = (high - low) / (2 * _SLOPE_STEP * step)
+    line = (edge(ends[1]) - edge(ends[0])) / (2 * _SLOPE_STEP * step)
+    variance, line_variance = (
+        np.einsum("dm,mn,dn->d", rows, curves.covariance[part, part], rows)
+        for rows in (basis, slope)
+    )
     information, offset = np.zeros(len(distance)), np.zeros(len(distance))
     for one in pixels.contours:
         if one.kind == kind and one.nearest:
@@ -313,119 +336,9 @@ def _profile(equations: Equations, curves: Curves, shapes: Shapes, kind: int) ->
         binned=value + mean,
         binned_sigma=spread,
         model=model,
+        line=line + slope @ curves.coefficients[part],
+        line_sigma=np.sqrt(np.maximum(line_variance, 0.0)),
         shift_um=shift,
         blur_um=blur,
         kurtosis=kurtosis,
-    )
-
-
-# ------------------------------------------------------------------------ several images
-
-
-def mean_edges(several: Sequence[Edges]) -> Edges:
-    """Mean over images of one scene, each with the same weight.
-
-    The map of the blur and the causes of misfit are means as well; errors are those of the
-    mean, the images taken as independent. Errors of the mask's contours are not: they are the
-    same in images of one place.
-
-    Raises
-    ------
-    ValueError
-        If there is no image, or their pixels differ.
-    """
-    if not several:
-        raise ValueError("there are no images to average")
-    first = several[0]
-    if len(several) == 1:
-        return first
-    if any(one.pixel_um != first.pixel_um for one in several):
-        raise ValueError("the images have different pixels and cannot be averaged")
-    numbers = {name: _mean_estimate([one.numbers[name] for one in several]) for name in _NUMBERS}
-    return Edges(
-        images=len(several),
-        pixel_um=first.pixel_um,
-        scale=float(np.mean([one.scale for one in several])),
-        profiles=tuple(
-            _mean_profile([one.profiles[kind] for one in several]) for kind in range(N_KINDS)
-        ),
-        **numbers,
-        transfer=(
-            _mean_transfer([one.transfer[0] for one in several]),
-            _mean_transfer([one.transfer[1] for one in several]),
-        ),
-        blur_map=_mean_map([one.blur_map for one in several]),
-        causes=tuple(
-            Cause(
-                one.name,
-                one.parameters,
-                float(np.mean([each.causes[k].chi2_ndf for each in several])),
-                float(np.mean([each.causes[k].rms for each in several])),
-            )
-            for k, one in enumerate(first.causes)
-        ),
-        chi2_ndf=float(np.mean([one.chi2_ndf for one in several])),
-        levelled=float(np.mean([one.levelled for one in several])),
-        noise_known=all(one.noise_known for one in several),
-    )
-
-
-def _mean_estimate(several: Sequence[Estimate]) -> Estimate:
-    values, sigmas = np.array(several).T
-    return Estimate(float(values.mean()), float(np.sqrt(np.sum(sigmas**2))) / len(values))
-
-
-def _mean_arrays(several: Sequence[Any], values: str, sigmas: str) -> tuple[Array, Array]:
-    value = np.mean([getattr(one, values) for one in several], axis=0)
-    sigma = np.sqrt(np.sum([getattr(one, sigmas) ** 2 for one in several], axis=0)) / len(several)
-    return value, sigma
-
-
-def _mean_profile(several: Sequence[EdgeProfile]) -> EdgeProfile:
-    length = min(len(one.distance_um) for one in several)
-
-    def cut(one: EdgeProfile) -> EdgeProfile:
-        inner = slice((len(one.distance_um) - length) // 2, (len(one.distance_um) + length) // 2)
-        names = ("distance_um", "value", "sigma", "binned", "binned_sigma", "model")
-        return replace(one, **{name: getattr(one, name)[inner] for name in names})
-
-    several = [cut(one) for one in several]
-    value, sigma = _mean_arrays(several, "value", "sigma")
-    binned, binned_sigma = _mean_arrays(several, "binned", "binned_sigma")
-    return EdgeProfile(
-        name=several[0].name,
-        distance_um=several[0].distance_um,
-        value=value,
-        sigma=sigma,
-        binned=binned,
-        binned_sigma=binned_sigma,
-        model=np.mean([one.model for one in several], axis=0),
-        shift_um=_mean_estimate([one.shift_um for one in several]),
-        blur_um=_mean_estimate([one.blur_um for one in several]),
-        kurtosis=_mean_estimate([one.kurtosis for one in several]),
-    )
-
-
-def _mean_transfer(several: Sequence[Transfer]) -> Transfer:
-    total, sigma = _mean_arrays(several, "total", "total_sigma")
-    return Transfer(
-        several[0].frequency_per_um,
-        total,
-        sigma,
-        np.mean([one.pixel for one in several], axis=0),
-        np.mean([one.model for one in several], axis=0),
-        several[0].diffraction,
-    )
-
-
-def _mean_map(several: Sequence[BlurMap]) -> BlurMap:
-    blur, sigma = _mean_arrays(several, "blur_um", "sigma_um")
-    return BlurMap(
-        several[0].u_um,
-        several[0].v_um,
-        blur,
-        sigma,
-        np.mean([one.plane for one in several], axis=0),
-        float(np.mean([one.chi2_ndf for one in several])),
-        float(np.mean([one.chi2_even for one in several])),
     )

@@ -144,7 +144,7 @@ def _of_images(
     bounds: tuple[int, int, int, int] | None,
 ) -> tuple[Edges, System, int]:
     """Mean over the images that can be used, the system used, and how many images there were."""
-    from rasnik.characterisation.edges import mean_edges
+    from rasnik.characterisation.edge_mean import mean_edges
     from rasnik.cli.track_terminal import progress
     from rasnik.io.images import expand_paths, iter_frames
 
