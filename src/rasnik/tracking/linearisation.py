@@ -134,7 +134,7 @@ class Builder:
         """
         assert self._next == self.tiles
         kept = self.weights.shape[1] - 1
-        coarse, fine = self._bases()
+        coarse, fine = self._bases
         rows, n_model = self._parameters()
         shaped = rows.reshape(len(rows), _N, N_MONOMIALS)
         whole = self.products.sum(axis=1)
@@ -162,7 +162,7 @@ class Builder:
         gain, covariance, rows, n_model = self._solved
         settings, state = self.settings, self.state
         kept = self.weights.shape[1] - 1
-        coarse, fine = self._bases()
+        coarse, fine = self._bases
         shaped = rows.reshape(len(rows), _N, N_MONOMIALS)
         whole = self.products.sum(axis=1)
         matrix = np.matmul(gain @ shaped[:, :kept].transpose(1, 0, 2), coarse.T)  # (s, k, t)
@@ -196,6 +196,7 @@ class Builder:
             limits=1 + _TILE_SIGMAS * np.sqrt(2 / np.maximum(self.counts[:, 0], 1)),
         )
 
+    @cached_property
     def _bases(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Monomials at the centres of the tiles, (tiles, 6), and of their parts, (.., parts, 6)."""
         camera = self.settings.camera

@@ -84,6 +84,13 @@ class Reading:
     def __len__(self) -> int:
         return len(self.steps)
 
+    @property
+    def chi2_ratio(self) -> NDArray[np.float64]:
+        """Chi-square per expected chi-square, shape (n,)."""
+        chi2, expected = self.statistics[:, [kernels.CHI2, kernels.EXPECTED]].T
+        ratio: NDArray[np.float64] = chi2 / np.maximum(expected, 1.0)
+        return ratio
+
 
 @dataclass(eq=False)
 class Reference:
@@ -151,7 +158,7 @@ class Reference:
         row = reading.statistics[0]
         if not np.isfinite(row).all():
             return
-        self.chi2_ratio = row[kernels.CHI2] / max(row[kernels.EXPECTED], 1.0)
+        self.chi2_ratio = float(reading.chi2_ratio[0])
         if self.chi2_ratio > _MISFIT:
             self.linear.limits[:] *= max(1.0, row[kernels.WORST_TILE])
             self.surprise = reading.steps[0, self.linear.n_parameters :].copy()
@@ -186,7 +193,7 @@ class Reference:
     def explains(self, reading: Reading) -> NDArray[np.bool_]:
         """Which frames the model describes, wherever the mask is."""
         linear, statistics = self.linear, reading.statistics.T
-        ratio = statistics[kernels.CHI2] / np.maximum(statistics[kernels.EXPECTED], 1.0)
+        ratio = reading.chi2_ratio
         bent = statistics[kernels.POSE_ENERGY] / linear.ndf * self.motion(reading) ** 2
         allowed = (
             _CHI2_SIGMAS * np.sqrt(2 / linear.ndf) * self.chi2_ratio
@@ -233,8 +240,7 @@ class Reference:
 
     def learn(self, reading: Reading) -> None:
         """Follow slow changes of the misfit with frames that were believed."""
-        statistics = reading.statistics
-        ratio = statistics[:, kernels.CHI2] / np.maximum(statistics[:, kernels.EXPECTED], 1.0)
+        ratio = reading.chi2_ratio
         share = 1 - (1 - 1 / _AVERAGED) ** len(ratio)
         self.chi2_ratio += share * (float(ratio.mean()) - self.chi2_ratio)
 

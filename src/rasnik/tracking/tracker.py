@@ -237,7 +237,7 @@ class Tracker:
             batch = self._batch(frames[done : done + self._at_once])
             n = self._track_batch(batch, slice(done, done + len(batch)), columns, mapping)
             if n == 0:  # the next frame needs more than one look
-                pose = self._look_closer(frames[done], time_s[done], number[done])
+                pose = self.update(frames[done], time_s[done], number[done])
                 for name in POSE_COLUMNS:
                     columns[name][done] = getattr(pose, name)
                 columns["flags"][done] = pose.flags
@@ -384,15 +384,6 @@ class Tracker:
 
     # ----------------------------------------------------------------- frames that do not fit
 
-    def _look_closer(self, frame: Image | None, t: float, number: int) -> Pose:
-        """The pose in a frame that did not fit, or for which there is no reference."""
-        arrival = self._arrivals.add(t, number)
-        grey = self._usable_frame(frame)
-        if grey is None:
-            return Pose(flags=Flag.NO_IMAGE | arrival)
-        reference = self._reference
-        return self._recover(grey, None if reference is None else reference.read([grey]), arrival)
-
     def _recover(self, grey: Image, reading: Reading | None, arrival: Flag) -> Pose:
         """First a new reference where the mask seems to be, then a full fit."""
         self._builder = None
@@ -400,8 +391,9 @@ class Tracker:
         if reference is None or reading is None:
             return self._fit(grey, arrival, self._prior)
         if not reference.usable(reading)[0]:
+            frame = self._prepared(grey)
             for state in self._guesses():
-                found = self._relocate(reference, grey, state)
+                found = self._relocate(reference, grey, frame, state)
                 if found is not None:
                     self._reference, close = found
                     self._accept(self._reference, close, [self._arrivals.clock])
@@ -425,11 +417,11 @@ class Tracker:
         yield reference.linear.stepped(step)
 
     def _relocate(
-        self, reference: Reference, grey: Image, state: State
+        self, reference: Reference, grey: Image, frame: Frame, state: State
     ) -> tuple[Reference, Reading] | None:
         """A reference that explains the frame, begun from a guess; None if there is none."""
         settings = reference.linear.settings
-        near = approach(self._prepared(grey), settings, state)
+        near = approach(frame, settings, state)
         if near is None:
             return None
         try:
@@ -438,8 +430,7 @@ class Tracker:
             return None
         self.references += 1
         reading = moved.read([grey])
-        good = moved.usable(reading)[0] and moved.explains(reading)[0]
-        return (moved, reading) if good else None
+        return (moved, reading) if moved.fits(reading)[0] else None
 
     def _expected(self) -> Pose | None:
         """The last pose that was tracked, moved to where the mask should be now."""
