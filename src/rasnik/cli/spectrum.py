@@ -11,6 +11,7 @@ import typer
 
 from rasnik.cli.budget import written
 from rasnik.cli.common import fail, load, messages, numbers, output
+from rasnik.cli.resolution import check_outputs
 
 if TYPE_CHECKING:
     from rasnik.characterisation.spectrum import Coherence
@@ -100,7 +101,7 @@ def spectrum_command(
     """
     from rasnik.characterisation.track_spectrum import bound_of, track_spectrum
 
-    files = _check_outputs(output_files)
+    files = check_outputs(output_files, _SUFFIXES)
     chosen = [_SHORT.get(name.strip(), name.strip()) for name in columns.split(",")]
     limits = numbers(floor_range, "--floor", "LOW,HIGH", least=2) if floor_range else None
     mains_hz = _mains(mains)
@@ -169,15 +170,6 @@ def spectrum_command(
 
 
 # ------------------------------------------------------------------------ what comes in
-
-
-def _check_outputs(paths: list[Path] | None) -> list[Path]:
-    for path in paths or ():
-        if path.suffix.lower() not in _SUFFIXES:
-            fail(f"{path}: the name must end in {', '.join(_SUFFIXES)}.")
-        if not path.parent.is_dir():
-            fail(f"{path} cannot be written: there is no folder {path.parent}.")
-    return list(paths or ())
 
 
 def _mains(text: str) -> tuple[float, ...]:
