@@ -43,8 +43,8 @@ def main() -> None:
         print(f"| {name} | {one.chi2_ndf:.2f} | {steps} |")
 
 
-def edges_of(folder: Path, row: dict) -> Edges:
-    """Edges of one image; where several positions explain it, at the first of them."""
+def analysed(folder: Path, row: dict) -> tuple[np.ndarray, Pose, System, tuple[int, int, int, int]]:
+    """One image, its pose, system and bounds; of several positions that explain it the first."""
     with Image.open(folder / row["file"]) as opened:
         image = np.asarray(opened.convert("L"))
     system = System(
@@ -65,7 +65,11 @@ def edges_of(folder: Path, row: dict) -> Edges:
         first = pose.candidates[0]
         prior = Pose(ok=True, x_um=first.x_um, y_um=first.y_um, orientation=first.orientation)
         pose = analyse(image, system, bounds=bounds, prior=prior)
-    return edges(image, pose, system, bounds)
+    return image, pose, system, bounds
+
+
+def edges_of(folder: Path, row: dict) -> Edges:
+    return edges(*analysed(folder, row))
 
 
 def numbers(one: Edges) -> list[str]:

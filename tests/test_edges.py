@@ -27,8 +27,8 @@ from rasnik.imaging.montecarlo import exact_image
 from rasnik.imaging.noise import ReadOut
 from rasnik.imaging.projection import Projection, sensor_grid_um
 from rasnik.imaging.transfer import AiryTransfer
-from rasnik.instrument import Optics, Sensor, System
-from rasnik.mask import ChessField
+from rasnik.instrument import System
+from real_edges import analysed
 
 SIZE = {"sensor.width_px": 256, "sensor.height_px": 192}
 SYSTEM = load_system("solidras", SIZE)
@@ -341,27 +341,7 @@ def test_faults_are_named() -> None:
 def _real(shared, name: str) -> tuple[np.ndarray, Pose, System, tuple[int, int, int, int]]:  # type: ignore[no-untyped-def]
     reference = json.loads(shared("real/reference.json").read_text())
     row = next(entry for entry in reference if entry["file"] == name)
-    with Image.open(shared("real") / name) as opened:
-        image = np.asarray(opened.convert("L"))
-    system = System(
-        name="image",
-        mask=ChessField(field_um=row["field_um"]),
-        optics=Optics(scale=1.0, blur_um=0.0),
-        sensor=Sensor(
-            width_px=image.shape[1],
-            height_px=image.shape[0],
-            pixel_um=row["pixel_um"],
-            dark_level=0.0,
-            light_level=255.0,
-        ),
-    )
-    bounds = tuple(row["bounds_left_top_right_bottom"])
-    pose = analyse(image, system, bounds=bounds)
-    if not pose.ok:
-        first = pose.candidates[0]
-        prior = Pose(ok=True, x_um=first.x_um, y_um=first.y_um, orientation=first.orientation)
-        pose = analyse(image, system, bounds=bounds, prior=prior)
-    return image, pose, system, bounds
+    return analysed(shared("real"), row)
 
 
 @pytest.mark.parametrize(
