@@ -12,10 +12,9 @@ from rasnik.analysis.frame import prepare_frame
 from rasnik.analysis.parameters import POSE_SIZE, Model, State
 from rasnik.imaging.appearance import Appearance, Camera
 from rasnik.imaging.model import expected_image
-from rasnik.tracking import kernels
-from rasnik.tracking.linearisation import Builder, Linearisation, Settings
+from rasnik.tracking import kernels, linearisation
+from rasnik.tracking.linearisation import Linearisation, Settings, linearise_in_parts
 from rasnik.tracking.motion import Motion
-from rasnik.tracking.reference import build
 
 Image = NDArray[Any]
 
@@ -75,7 +74,7 @@ def linearise(
     noise = (0.26 + 1 / 12, 0.011)
     valid = np.ones(system.shape, dtype=np.uint8) if valid is None else valid
     settings = Settings(system.mask, camera_of(system), noise, model, True, valid)
-    return build(settings, State(projection(), appearance()))
+    return linearisation.linearise(settings, State(projection(), appearance()))
 
 
 def read(linear: Linearisation, image: Image) -> tuple[Image, Image]:
@@ -139,12 +138,9 @@ def test_what_a_similarity_cannot_describe_is_a_surprise(small: System) -> None:
 
 def test_built_in_parts_it_is_the_same(small: System) -> None:
     whole = linearise(small)
-    builder = Builder(whole.settings, whole.state)
-    calls = 1
-    while not builder.advance(7):
-        calls += 1
-    assert calls == -(-builder.tiles // 7)
-    parts = builder.finish()
+    *pauses, parts = linearise_in_parts(whole.settings, whole.state, 7)
+    assert pauses == [None] * len(pauses) and len(pauses) > len(whole.scales) // 7
+    assert parts is not None
     for name in ("level", "weights", "scales", "matrix", "counts", "covariance"):
         np.testing.assert_array_equal(getattr(parts, name), getattr(whole, name))
 

@@ -12,7 +12,8 @@ rotation mean the same in all three.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from math import sqrt
 from typing import Literal
 
 import numpy as np
@@ -125,38 +126,50 @@ def stepped(state: State, step: NDArray[np.float64], model: Model, min_blur_um: 
     `KURTOSIS_RANGE`.
     """
     n_pose = POSE_SIZE[model]
-    light, shape = step[n_pose : n_pose + N_LIGHT], step[n_pose + N_LIGHT :]
-    appearance = _reshaped(state.appearance, shape, min_blur_um)
-    appearance = replace(
-        appearance, dark=appearance.dark + light[:6], light=appearance.light + light[6:]
-    )
+    old, light = state.appearance, step[n_pose : n_pose + N_LIGHT]
+    blur, shift, excess = _reshaped(old, step[n_pose + N_LIGHT :].tolist(), min_blur_um)
+    appearance = Appearance(old.dark + light[:6], old.light + light[6:], blur, shift, excess)
     return State(_moved(state.projection, step[:n_pose]), appearance)
 
 
-def _reshaped(old: Appearance, step: NDArray[np.float64], min_blur_um: float) -> Appearance:
-    if not len(step):
-        return old
-    variance = old.blur_um**2 + step[0]
-    blur = float(np.sqrt(np.clip(variance, (old.blur_um / 1.5) ** 2, (old.blur_um * 1.5) ** 2)))
-    blur = max(blur, min_blur_um)
+def _reshaped(old: Appearance, step: list[float], min_blur_um: float) -> tuple[float, float, float]:
+    """Blur, edge shift and kurtosis after a step."""
+    if not step:
+        return old.blur_um, old.edge_shift_um, old.kurtosis
+    variance = max(old.blur_um**2 + step[0], (old.blur_um / 1.5) ** 2)
+    blur = max(min(sqrt(variance), 1.5 * old.blur_um), min_blur_um)
     excess = old.kurtosis * (old.blur_um / blur) ** 4
     if len(step) == 3:
-        excess = float(np.clip(excess + step[2] / blur**4, *KURTOSIS_RANGE))
-    shift = old.edge_shift_um + float(step[1])
-    return replace(old, blur_um=blur, edge_shift_um=shift, kurtosis=excess)
+        low, high = KURTOSIS_RANGE
+        excess = min(max(excess + step[2] / blur**4, low), high)
+    return blur, old.edge_shift_um + step[1], excess
 
 
 def _moved(projection: Projection, step: NDArray[np.float64]) -> Projection:
-    shift, log_scale, angle = step[:2], step[2], step[3]
-    c, s = np.cos(angle), np.sin(angle)
-    change = np.exp(-log_scale) * np.array([[c, -s], [s, c]])
-    if len(step) > 4:
-        change = change @ (np.eye(2) + step[4] * _GENERATORS[2] + step[5] * _GENERATORS[3])
-    tilt = projection.matrix[2, :2] + (step[6:8] if len(step) > 6 else 0.0)
-    origin = projection.matrix[:2, 2] + shift
-    local = projection.jacobian @ change
-    matrix = np.eye(3)
-    matrix[:2, :2] = local + np.outer(origin, tilt)
-    matrix[:2, 2] = origin
-    matrix[2, :2] = tilt
-    return Projection(matrix)
+    """In plain numbers, as every frame of a stream takes a step."""
+    (a, b, x), (c, d, y), (tilt_u, tilt_v, _) = projection.matrix.tolist()
+    a, b, c, d = a - x * tilt_u, b - x * tilt_v, c - y * tilt_u, d - y * tilt_v  # L
+    dx, dy, log_scale, angle, *rest = step.tolist()
+    p, q, du, dv = (*rest, 0.0, 0.0, 0.0, 0.0)[:4]
+    size = np.exp(-log_scale)
+    cos, sin = float(size * np.cos(angle)), float(size * np.sin(angle))
+    right = cos * (1 + p) - sin * q, cos * q - sin * (1 - p)  # E, row by row
+    down = sin * (1 + p) + cos * q, sin * q + cos * (1 - p)
+    x, y, tilt_u, tilt_v = x + dx, y + dy, tilt_u + du, tilt_v + dv
+    return Projection(
+        np.array(
+            [
+                [
+                    a * right[0] + b * down[0] + x * tilt_u,
+                    a * right[1] + b * down[1] + x * tilt_v,
+                    x,
+                ],
+                [
+                    c * right[0] + d * down[0] + y * tilt_u,
+                    c * right[1] + d * down[1] + y * tilt_v,
+                    y,
+                ],
+                [tilt_u, tilt_v, 1.0],
+            ]
+        )
+    )

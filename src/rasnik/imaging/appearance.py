@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,15 +41,17 @@ class Camera:
         """Half the width and half the height of the array."""
         return self.shape[1] * self.pixel_um / 2, self.shape[0] * self.pixel_um / 2
 
-    @property
+    @cached_property
     def corners_um(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """u and v of the outer corners of the array, shape (4,) each."""
         (u0, v0), (height, width) = self.origin_um, self.shape
         u = u0 + self.pixel_um * (np.array([0, 1, 0, 1]) * width - 0.5)
         v = v0 + self.pixel_um * (np.array([0, 0, 1, 1]) * height - 0.5)
+        u.setflags(write=False)
+        v.setflags(write=False)
         return u, v
 
-    @property
+    @cached_property
     def centre_um(self) -> tuple[float, float]:
         """(u, v) of the centre of the array."""
         u, v = self.corners_um

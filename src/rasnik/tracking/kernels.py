@@ -37,6 +37,7 @@ _careful = njit(
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _LARGEST = np.float32(127.0)
+_ALL_BUT_SIGN = np.int32(0x7FFFFFFF)
 _GOLDEN = np.float32(0.6180339887)  # its multiples are spread evenly between whole numbers
 
 
@@ -93,12 +94,10 @@ def store(
             for lane in range(TILE * TILE):
                 work[ROOT, lane] = _ZERO
             for row in range(rows):
-                for column in range(columns):
-                    lane = row * TILE + column
-                    good = valid[row0 + row, column0 + column]
-                    work[ROOT, lane] = np.float32(good)
-                    counts[t, 0] += good
-                    level[row0 + row, column0 + column] = work[LEVEL, lane]
+                counts[t, 0] += _begin_row(
+                    work[ROOT], work[LEVEL], np.uint32(row * TILE),
+                    valid[row0 + row], level[row0 + row], np.uint32(column0), columns,
+                )  # fmt: skip
             for s in range(kept):
                 _to_tile(work[s], plain[s], part * TILE, wide)
             for lane in range(TILE * TILE):
@@ -124,11 +123,30 @@ def store(
         for s in range(kept):
             scales[t, s] = _quantise(weighted[s], weights[t, s])
             for other in range(kept):
-                rounded = scales[t, s] * _dot(
+                rounding[t, s, other] = scales[t, s] * _dot(
                     plain[other], weights[t, s], np.uint32(0), TILE * wide
                 )
-                exact = _dot_rows(weighted[s], plain[other], TILE * wide)
-                rounding[t, s, other] = rounded - exact
+        k = 0
+        for s in range(_N_MODEL):
+            for other in range(s, _N_MODEL):
+                if other < kept:
+                    exact = products[t, :, k].sum()
+                    rounding[t, s, other] -= exact
+                    if other != s:
+                        rounding[t, other, s] -= exact
+                k += 1
+
+
+@_compiled
+def _begin_row(used, expected, first, valid, level, column0, columns):
+    """Which pixels of a row are used, and their expected grey level; how many there are."""
+    count = 0
+    for column in range(columns):
+        lane, at = first + np.uint32(column), column0 + np.uint32(column)
+        used[lane] = np.float32(valid[at])
+        count += valid[at]
+        level[at] = expected[lane]
+    return count
 
 
 @_compiled
@@ -156,12 +174,23 @@ def _dot_rows(first, second, size):
 
 
 @_compiled
+def _largest(values):
+    """Largest absolute value. Numbers and their bits, read as integers, have the same order;
+    for integers the loop is compiled to vector instructions."""
+    bits = values.view(np.int32)
+    largest = np.zeros(1, dtype=np.int32)
+    found = largest[0]
+    for k in range(bits.size):
+        size = bits[k] & _ALL_BUT_SIGN
+        found = size if size > found else found
+    largest[0] = found
+    return largest.view(np.float32)[0]
+
+
+@_compiled
 def _quantise(values, integers):
     """Round to 8-bit integers; returns the value of one unit."""
-    largest = _ZERO
-    for k in range(values.size):
-        largest = max(largest, abs(values[k]))
-    unit = largest / _LARGEST
+    unit = _largest(values) / _LARGEST
     factor = _ONE / unit if unit > _ZERO else _ZERO
     for k in range(values.size):
         integers[k] = np.int8(np.rint(values[k] * factor))
@@ -171,10 +200,7 @@ def _quantise(values, integers):
 @_compiled
 def _quantise_evenly(values, integers):
     """The same for values that hardly differ: as often up as down, so that their sum stays."""
-    largest = _ZERO
-    for k in range(values.size):
-        largest = max(largest, values[k])
-    unit = largest / (_LARGEST - _ONE)
+    unit = _largest(values) / (_LARGEST - _ONE)
     factor = _ONE / unit if unit > _ZERO else _ZERO
     for k in range(values.size):
         turn = np.float32(k) * _GOLDEN

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from math import exp, sqrt
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from rasnik.analysis.parameters import POSE_SIZE, Model, State
 from rasnik.analysis.pose import Pose
 from rasnik.imaging.projection import wrap_angle
 from rasnik.tracking import kernels
-from rasnik.tracking.linearisation import Builder, Linearisation, Settings
+from rasnik.tracking.linearisation import Linearisation, Settings, linearise
 
 __all__ = [
     "LIGHT_USABLE",
@@ -28,7 +29,6 @@ __all__ = [
     "Reading",
     "Reference",
     "approach",
-    "build",
     "model_of",
 ]
 
@@ -65,31 +65,34 @@ _LASTING = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Reading:
-    """What a reference says of n frames.
+class Statistics(NamedTuple):
+    """How well a step explains a frame, in the order of `kernels.estimate`."""
+
+    chi2: float
+    expected: float
+    worst_tile: float
+    motion: float
+    contrast: float
+    pose_energy: float
+    surprise: float
+
+
+class Reading(NamedTuple):
+    """What a reference says of a frame: plain numbers, as each is looked at many times.
 
     Attributes
     ----------
-    steps : ndarray, shape (n, k)
-    statistics : ndarray, shape (n, kernels.N_STATISTICS)
+    step : ndarray, shape (k,)
+    statistics : Statistics
     """
 
-    steps: NDArray[np.float64]
-    statistics: NDArray[np.float64]
-
-    def __getitem__(self, index: slice) -> Reading:
-        return Reading(self.steps[index], self.statistics[index])
-
-    def __len__(self) -> int:
-        return len(self.steps)
+    step: NDArray[np.float64]
+    statistics: Statistics
 
     @property
-    def chi2_ratio(self) -> NDArray[np.float64]:
-        """Chi-square per expected chi-square, shape (n,)."""
-        chi2, expected = self.statistics[:, [kernels.CHI2, kernels.EXPECTED]].T
-        ratio: NDArray[np.float64] = chi2 / np.maximum(expected, 1.0)
-        return ratio
+    def chi2_ratio(self) -> float:
+        """Chi-square per expected chi-square."""
+        return self.statistics.chi2 / max(self.statistics.expected, 1.0)
 
 
 @dataclass(eq=False)
@@ -106,7 +109,7 @@ class Reference:
         Factors on the uncertainty of x, y, S, theta_z for what the noise does not explain.
     chi2_ratio : float
         Chi-square per expected chi-square.
-    surprise : ndarray
+    surprise : ndarray, optional
         What a richer map explains, if the image fits badly from the beginning.
     """
 
@@ -114,7 +117,7 @@ class Reference:
     origin: Pose
     growth: NDArray[np.float64] = field(default_factory=lambda: np.ones(4))
     chi2_ratio: float = 1.0
-    surprise: NDArray[np.float64] | float = 0.0
+    surprise: NDArray[np.float64] | None = None
     begun: float | None = None
     """When the mask was first seen near this reference, in frames."""
 
@@ -145,23 +148,22 @@ class Reference:
             valid = find_outliers(frame.image, valid, *arguments, frame.noise)
         noise = frame.noise or estimate_noise(frame.image, valid, *arguments)
         settings = Settings(frame.mask, frame.camera, noise, model_of(pose), free, valid)
-        reference = cls(build(settings, state), pose)
+        reference = cls(linearise(settings, state), pose)
         sigmas = np.sqrt(np.diag(pose.covariance) / np.diag(reference._covariance))
         enlarged = pose.flags & (Flag.MODEL_MISFIT | Flag.NOISE_ESTIMATED)
         reference.growth = np.maximum(sigmas, 1.0) if enlarged else np.ones(4)
-        reading = reference.read([frame.image])
+        (reading,) = reference.read([frame.image])
         reference._settle(reading)
         return reference, reading
 
     def _settle(self, reading: Reading) -> None:
         """Take the first frame's misfit as what is to be expected of the next."""
-        row = reading.statistics[0]
-        if not np.isfinite(row).all():
+        if not np.isfinite(reading.statistics).all():
             return
-        self.chi2_ratio = float(reading.chi2_ratio[0])
+        self.chi2_ratio = reading.chi2_ratio
         if self.chi2_ratio > _MISFIT:
-            self.linear.limits[:] *= max(1.0, row[kernels.WORST_TILE])
-            self.surprise = reading.steps[0, self.linear.n_parameters :].copy()
+            self.linear.limits[:] *= max(1.0, reading.statistics.worst_tile)
+            self.surprise = reading.step[self.linear.n_parameters :].copy()
 
     def moved_to(self, linear: Linearisation) -> Reference:
         """The same expectations about another linearisation."""
@@ -173,76 +175,66 @@ class Reference:
     def read(
         self,
         frames: Sequence[NDArray[Any]],
-        mapping: Callable[[Callable[[int], None], Iterable[int]], Iterable[None]] = map,
-    ) -> Reading:
+        mapping: Callable[..., Iterable[Reading]] = map,
+    ) -> list[Reading]:
         """Estimate frames; `mapping` may work on several at a time."""
-        steps = np.zeros((len(frames), self.linear.n_steps))
-        statistics = np.zeros((len(frames), kernels.N_STATISTICS))
+        return list(mapping(self._read, frames))
 
-        def one(k: int) -> None:
-            self.linear.estimate(frames[k], steps[k], statistics[k])
+    def _read(self, frame: NDArray[Any]) -> Reading:
+        step, statistics = np.empty(self.linear.n_steps), np.empty(kernels.N_STATISTICS)
+        self.linear.estimate(frame, step, statistics)
+        return Reading(step, Statistics(*statistics.tolist()))
 
-        for _ in mapping(one, range(len(frames))):
-            pass
-        return Reading(steps, statistics)
+    def fits(self, reading: Reading) -> bool:
+        """Whether a frame is explained: nothing moved far, nothing in the way, the same light."""
+        return self.usable(reading) and self.explains(reading)
 
-    def fits(self, reading: Reading) -> NDArray[np.bool_]:
-        """Which frames are explained: nothing moved far, nothing in the way, the same light."""
-        return self.usable(reading) & self.explains(reading)
-
-    def explains(self, reading: Reading) -> NDArray[np.bool_]:
-        """Which frames the model describes, wherever the mask is."""
-        linear, statistics = self.linear, reading.statistics.T
-        ratio = reading.chi2_ratio
-        bent = statistics[kernels.POSE_ENERGY] / linear.ndf * self.motion(reading) ** 2
+    def explains(self, reading: Reading) -> bool:
+        """Whether the model describes a frame, wherever the mask is."""
+        ndf, statistics = self.linear.ndf, reading.statistics
+        bent = statistics.pose_energy / ndf * self.motion(reading) ** 2
         allowed = (
-            _CHI2_SIGMAS * np.sqrt(2 / linear.ndf) * self.chi2_ratio
+            _CHI2_SIGMAS * sqrt(2 / ndf) * self.chi2_ratio
             + _MISFIT_DRIFT * abs(self.chi2_ratio - 1)
             + _CURVATURE * bent
         )
-        extra = reading.steps[:, linear.n_parameters :] - self.surprise
-        surprise = (extra**2).sum(axis=1)
-        good: NDArray[np.bool_] = (
-            (np.abs(ratio - self.chi2_ratio) < allowed)
-            & (statistics[kernels.WORST_TILE] < 1 + bent)
-            & (surprise < _SURPRISE * max(1.0, self.chi2_ratio))
+        return (
+            abs(reading.chi2_ratio - self.chi2_ratio) < allowed
+            and statistics.worst_tile < 1 + bent
+            and self._surprise(reading) < _SURPRISE * max(1.0, self.chi2_ratio)
         )
-        return good
 
-    def motion(self, reading: Reading) -> NDArray[np.float64]:
+    def _surprise(self, reading: Reading) -> float:
+        """What a richer map would explain that it did not explain before."""
+        if self.surprise is None:
+            return reading.statistics.surprise
+        extra = reading.step[self.linear.n_parameters :] - self.surprise
+        return float(extra @ extra)
+
+    def motion(self, reading: Reading) -> float:
         """Largest motion of the mask over the image, in widths of an edge."""
-        motion: NDArray[np.float64] = (
-            reading.statistics[:, kernels.MOTION] / self.linear.edge_width_fields
-        )
-        return motion
+        return reading.statistics.motion / self.linear.edge_width_fields
 
-    def usable(self, reading: Reading) -> NDArray[np.bool_]:
-        """Which frames are near enough for what the reference says of them."""
-        return (self.motion(reading) < USABLE) & ~self.light_changed(reading)
+    def usable(self, reading: Reading) -> bool:
+        """Whether a frame is near enough for what the reference says of it."""
+        return self.motion(reading) < USABLE and not self.light_changed(reading)
 
-    def near(self, reading: Reading) -> NDArray[np.bool_]:
-        """Which frames are so near that no new reference is wanted."""
+    def near(self, reading: Reading) -> bool:
+        """Whether a frame is so near that no new reference is wanted."""
         shape = POSE_SIZE[self.linear.settings.model] + 12
         variance = self.linear.state.appearance.blur_um**2
-        light = np.abs(reading.statistics[:, kernels.CONTRAST] - 1)
-        near: NDArray[np.bool_] = (
-            (self.motion(reading) < NEAR)
-            & (light < _LIGHT_NEAR)
-            & (np.abs(reading.steps[:, shape]) < 2 * _BLUR_NEAR * variance)
+        return (
+            self.motion(reading) < NEAR
+            and abs(reading.statistics.contrast - 1) < _LIGHT_NEAR
+            and abs(reading.step.item(shape)) < 2 * _BLUR_NEAR * variance
         )
-        return near
 
-    def light_changed(self, reading: Reading) -> NDArray[np.bool_]:
-        changed: NDArray[np.bool_] = ~(
-            np.abs(reading.statistics[:, kernels.CONTRAST] - 1) < LIGHT_USABLE
-        )
-        return changed
+    def light_changed(self, reading: Reading) -> bool:
+        return not abs(reading.statistics.contrast - 1) < LIGHT_USABLE
 
     def learn(self, reading: Reading) -> None:
-        """Follow slow changes of the misfit with frames that were believed."""
-        ratio = reading.chi2_ratio
-        share = 1 - (1 - 1 / _AVERAGED) ** len(ratio)
-        self.chi2_ratio += share * (float(ratio.mean()) - self.chi2_ratio)
+        """Follow slow changes of the misfit with a frame that was believed."""
+        self.chi2_ratio += (reading.chi2_ratio - self.chi2_ratio) / _AVERAGED
 
     @property
     def near_um(self) -> float:
@@ -266,23 +258,28 @@ class Reference:
         unit = np.array([1.0, 1.0, np.exp(self.vector[2]), 1.0])
         return self.linear.covariance[:4, :4] * np.outer(unit, unit)
 
-    def _noise_factor(self, reading: Reading) -> NDArray[np.float64]:
-        """Growth of the uncertainty with the light: noise over contrast."""
-        statistics = reading.statistics.T
-        variance = statistics[kernels.EXPECTED] / max(self.linear.n_pixels, 1)
-        factor: NDArray[np.float64] = np.sqrt(np.maximum(variance, 0.0)) / np.maximum(
-            statistics[kernels.CONTRAST], 1e-9
-        )
-        return factor
+    @cached_property
+    def _grown(self) -> NDArray[np.float64]:
+        """The same with what the noise does not explain."""
+        return self._covariance * np.outer(self.growth, self.growth)
 
-    def columns(self, reading: Reading) -> dict[str, NDArray[Any] | float]:
+    def _noise_factor(self, reading: Reading) -> float:
+        """Growth of the uncertainty with the light: noise over contrast."""
+        variance = reading.statistics.expected / max(self.linear.n_pixels, 1)
+        return sqrt(max(variance, 0.0)) / max(reading.statistics.contrast, 1e-9)
+
+    def _chi2_ndf(self, reading: Reading) -> float:
+        chi2, expected = reading.statistics.chi2, reading.statistics.expected
+        return chi2 / max(expected * self.linear.ndf / max(self.linear.n_pixels, 1), 1.0)
+
+    def columns(self, readings: Sequence[Reading]) -> dict[str, NDArray[Any]]:
         """The columns of a track for frames that fit."""
         x, y, log_scale, theta = self.vector
-        steps = reading.steps.T
+        steps = np.array([reading.step for reading in readings]).T
         light = POSE_SIZE[self.linear.settings.model]
         appearance = self.linear.state.appearance
-        factor = self._noise_factor(reading)
-        sigma = np.sqrt(np.diag(self._covariance)) * self.growth
+        factor = np.array([self._noise_factor(reading) for reading in readings])
+        sigma = np.sqrt(np.diag(self._grown))
         return {
             "x_um": x + steps[0],
             "y_um": y + steps[1],
@@ -292,43 +289,35 @@ class Reference:
             "sigma_y_um": sigma[1] * factor,
             "sigma_scale": sigma[2] * factor,
             "sigma_theta_rad": sigma[3] * factor,
-            "chi2_ndf": self._chi2_ndf(reading),
+            "chi2_ndf": np.array([self._chi2_ndf(reading) for reading in readings]),
             "blur_um": np.sqrt(np.maximum(appearance.blur_um**2 + steps[light + 12], 0.0)),
             "dark_level": appearance.dark[0] + steps[light],
             "light_level": appearance.light[0] + steps[light + 6],
         }
 
-    def _chi2_ndf(self, reading: Reading) -> NDArray[np.float64]:
-        statistics = reading.statistics.T
-        degrees = statistics[kernels.EXPECTED] * self.linear.ndf / max(self.linear.n_pixels, 1)
-        ratio: NDArray[np.float64] = statistics[kernels.CHI2] / np.maximum(degrees, 1.0)
-        return ratio
-
     def pose(self, reading: Reading, flags: Flag = Flag.NONE) -> Pose:
-        """The pose in one frame that fits."""
-        step = reading.steps[0]
-        state = self.linear.stepped(step)
-        x, y, log_scale, theta = self.vector + step[:4]
-        growth = self.growth * self._noise_factor(reading)[0]
+        """The pose in a frame that fits."""
+        state = self.linear.stepped(reading.step)
+        x, y, log_scale, theta = (self.vector + reading.step[:4]).tolist()
         appearance = state.appearance
         return Pose(
             ok=True,
-            x_um=float(x),
-            y_um=float(y),
-            scale=float(np.exp(log_scale)),
+            x_um=x,
+            y_um=y,
+            scale=exp(log_scale),
             theta_rad=wrap_angle(theta),
             orientation=self.origin.orientation,
-            covariance=self._covariance * growth * growth[:, None],
-            chi2_ndf=float(self._chi2_ndf(reading)[0]),
+            covariance=self._grown * self._noise_factor(reading) ** 2,
+            chi2_ndf=self._chi2_ndf(reading),
             blur_um=appearance.blur_um,
-            dark_level=float(appearance.dark[0]),
-            light_level=float(appearance.light[0]),
+            dark_level=appearance.dark.item(0),
+            light_level=appearance.light.item(0),
             edge_shift_um=appearance.edge_shift_um,
             polarity=self.origin.polarity,
             code_lines_read=self.origin.code_lines_read,
             code_lines_in_view=self.origin.code_lines_in_view,
             masked_fraction=1 - self.linear.n_pixels / self.linear.level.size,
-            flags=self.flags | flags,
+            flags=self.flags | flags if flags else self.flags,
             projection=state.projection,
             appearance=appearance,
             method=self.origin.method,
@@ -364,13 +353,6 @@ def _sane(start: State, found: State) -> bool:
     before, after = (state.projection.similarity()[0] for state in (start, found))
     light, dark = found.appearance.light[0], found.appearance.dark[0]
     return bool(abs(np.log(after / before)) < _SCALE_CHANGE and np.isfinite(light) and light > dark)
-
-
-def build(settings: Settings, state: State) -> Linearisation:
-    """A linearisation made in one go."""
-    builder = Builder(settings, state)
-    builder.advance()
-    return builder.finish()
 
 
 def model_of(pose: Pose) -> Model:

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import count, islice
+from math import ceil
 from typing import Any, Literal
 
 import numpy as np
@@ -25,7 +26,7 @@ from rasnik.analysis.parameters import POSE_SIZE, Model, State
 from rasnik.analysis.pose import Pose
 from rasnik.instrument import System
 from rasnik.tracking.arrival import Arrivals
-from rasnik.tracking.linearisation import Builder
+from rasnik.tracking.linearisation import Linearisation, linearise, linearise_in_parts
 from rasnik.tracking.motion import Motion
 from rasnik.tracking.reference import (
     LIGHT_USABLE,
@@ -34,17 +35,18 @@ from rasnik.tracking.reference import (
     Reading,
     Reference,
     approach,
-    build,
     model_of,
 )
+from rasnik.tracking.tiling import tiling
 from rasnik.tracking.track import POSE_COLUMNS, TRACK_COLUMNS, Track
 
 __all__ = ["Tracker"]
 
 Image = NDArray[Any]
 
-_SLICES = 32  # parts in which a new reference is made in a stream
-_BREATH_S = 5e-3  # time between them, so that a fast stream catches up
+_WORK_S = 0.12  # of a stream, over which the work on a new reference is spread
+_STEPS = 6  # of that work beside those on tiles
+_EARLY = 0.5  # of the range of a reference: where a stream begins to work on the next
 _SOON = 32  # frames; a reference that lasts as long need not be set ahead
 _NO_OTHER = 20  # times the range of a reference: guesses so close lead to the same place
 _PATIENCE = 3  # frames with something in the way before that is taken as lasting
@@ -59,7 +61,7 @@ _PASSING = (  # what a frame may have called for that later ones do not
     | Flag.SATURATED
 )
 _MOST_AT_ONCE = 64  # frames
-_AS_STORED = ("uint8", "uint16", "float32")
+_AS_STORED = tuple(np.dtype(name) for name in ("uint8", "uint16", "float32"))
 
 
 class Tracker:
@@ -108,7 +110,7 @@ class Tracker:
         self._prior = prior
         self._reference: Reference | None = None
         self._last: tuple[Reference, Reading] | None = None  # that fitted
-        self._builder: Builder | None = None
+        self._work: Iterator[Linearisation | None] | None = None
         self._motion = Motion()
         self._began_at = np.zeros(4)  # the step when the reference came into use
         self._ask_after, self._ask_at = _ASKED_AFTER, 0.0  # frames, whether less would do
@@ -148,10 +150,10 @@ class Tracker:
         reference = self._reference
         if reference is None:
             return self._recover(grey, None, arrival)
-        reading = reference.read([grey])
-        if not reference.fits(reading)[0]:
+        (reading,) = reference.read([grey])
+        if not reference.fits(reading):
             return self._recover(grey, reading, arrival)
-        self._accept(reference, reading, [self._arrivals.clock])
+        self._accept(reference, reading, self._arrivals.clock)
         self._work_ahead(reference, reading)
         self._reconsider(grey)
         return reference.pose(reading, arrival)
@@ -264,36 +266,34 @@ class Tracker:
         reference = self._reference
         if reference is None or not batch:
             return 0
-        reading = reference.read(batch, mapping)
-        good, near = reference.fits(reading), reference.near(reading)
-        n = len(batch) if good.all() else int(np.argmin(good))
-        if not near[:n].all():  # that frame still counts; the next ones get a new reference
-            n = int(np.argmin(near[:n])) + 1
+        readings: list[Reading] = []
+        for reading in reference.read(batch, mapping):
+            if not reference.fits(reading):
+                break
+            k = rows.start + len(readings)
+            arrival = self._arrivals.add(columns["time_s"][k], columns["frame"][k])
+            columns["flags"][k] = int(reference.flags | arrival)
+            self._accept(reference, reading, self._arrivals.clock)
+            readings.append(reading)
+            if not reference.near(reading):  # the next ones get a new reference
+                break
+        n = len(readings)
         if n == 0:
             return 0
-        rows = slice(rows.start, rows.start + n)
-        reading = reading[:n]
-        for name, values in reference.columns(reading).items():
-            columns[name][rows] = values
-        clock = []
-        arrivals = zip(columns["time_s"][rows], columns["frame"][rows], strict=True)
-        for k, (t, number) in enumerate(arrivals, rows.start):
-            columns["flags"][k] = int(reference.flags | self._arrivals.add(t, number))
-            clock.append(self._arrivals.clock)
-        self._accept(reference, reading, clock)
-        if not near[n - 1]:
-            self._follow(reference, reading[n - 1 :])
+        for name, values in reference.columns(readings).items():
+            columns[name][rows.start : rows.start + n] = values
+        if not reference.near(readings[-1]):
+            self._follow(reference, readings[-1])
         self._reconsider(batch[n - 1])
         return n
 
-    def _accept(self, reference: Reference, reading: Reading, clock: list[float]) -> None:
-        """Learn from frames that fit."""
+    def _accept(self, reference: Reference, reading: Reading, clock: float) -> None:
+        """Learn from a frame that fits."""
         reference.learn(reading)
         if reference.begun is None:
-            reference.begun, self._began_at = clock[0], reading.steps[0, :4].copy()
-        for time, step in zip(clock[-3:], reading.steps[-3:], strict=True):
-            self._motion.add(time, reference.vector + step[:4])
-        self._last = reference, reading[len(reading) - 1 :]
+            reference.begun, self._began_at = clock, reading.step[:4]
+        self._motion.add(clock, reference.vector + reading.step[:4])
+        self._last = reference, reading
         self._odd = 0
 
     # ----------------------------------------------------------------- new references
@@ -309,58 +309,52 @@ class Tracker:
         """Mean change of the pose per frame since the reference came into use, shape (4,)."""
         if reference.begun is None or reference.begun == self._arrivals.clock:
             return np.zeros(4)
-        return (reading.steps[0, :4] - self._began_at) / (self._arrivals.clock - reference.begun)
+        return (reading.step[:4] - self._began_at) / (self._arrivals.clock - reference.begun)
 
     def _ahead(self, reference: Reference, reading: Reading, frames: float) -> State:
-        step = reading.steps[0].copy()
+        step = reading.step.copy()
         step[:4] += frames * self._velocity(reference, reading)
         return reference.linear.stepped(step)
 
     def _replace(self, reference: Reference, reading: Reading, frames: float) -> None:
         state = self._ahead(reference, reading, frames)
-        self._builder = None
+        self._work = None
         try:
-            self._reference = reference.moved_to(build(reference.linear.settings, state))
+            self._reference = reference.moved_to(linearise(reference.linear.settings, state))
         except ValueError:  # a state that cannot be modelled; the next frame decides
             return
         self.references += 1
 
     def _work_ahead(self, reference: Reference, reading: Reading) -> None:
         """A part of the work on a new reference, in a stream that must not wait."""
-        builder = self._builder
-        if builder is None:
+        period = self._arrivals.period_s
+        share = 1 / _SOON if np.isnan(period) else min(period / _WORK_S, 1.0)  # of the work
+        if self._work is None:
             # early, as the mask moves on while the work is done
-            if not reference.near(reading)[0] or reference.motion(reading)[0] > NEAR / 2:
-                try:
-                    state = self._ahead(reference, reading, _SLICES * self._pause())
-                    self._builder = Builder(reference.linear.settings, state)
-                except ValueError:
-                    return
+            if not reference.near(reading) or reference.motion(reading) > _EARLY * NEAR:
+                state = self._ahead(reference, reading, 1 / share)
+                settings = reference.linear.settings
+                tiles = ceil(share * tiling(settings.camera).count)
+                self._work = linearise_in_parts(settings, state, tiles)
             return
-        if self._arrivals.clock % self._pause():
-            return
-        if not builder.advance(-(-builder.tiles // _SLICES)):
-            return
-        try:
-            if not builder.solved:  # that is work enough for one frame
-                builder.solve()
+        for _ in range(ceil(share * _STEPS)):
+            try:
+                linear = next(self._work)
+            except ValueError:  # a state that cannot be modelled
+                self._work = None
                 return
-            linear = builder.finish()
-        except ValueError:
-            self._builder = None
-            return
-        self._builder = None
-        moved = reference.moved_to(linear)
-        if _distance(reference.vector + reading.steps[0, :4] - moved.vector) < _distance(
-            reading.steps[0, :4]
-        ):
+            if linear is not None:
+                self._work = None
+                self._change_to(reference.moved_to(linear), reading)
+                return
+
+    def _change_to(self, moved: Reference, reading: Reading) -> None:
+        """Take a new reference if the mask is nearer to it than to the present one."""
+        assert self._reference is not None
+        step = reading.step[:4]
+        if _distance(self._reference.vector + step - moved.vector) < _distance(step):
             self._reference = moved
             self.references += 1
-
-    def _pause(self) -> int:
-        """Every how many frames some of a new reference is made: each at 275 Hz, 4th at 860."""
-        period = self._arrivals.period_s
-        return 1 if np.isnan(period) else max(1, round(_BREATH_S / period))
 
     def _reconsider(self, grey: Image) -> None:
         """Whether a full fit would find less amiss now, asked more and more seldom.
@@ -386,17 +380,17 @@ class Tracker:
 
     def _recover(self, grey: Image, reading: Reading | None, arrival: Flag) -> Pose:
         """First a new reference where the mask seems to be, then a full fit."""
-        self._builder = None
+        self._work = None
         reference = self._reference
         if reference is None or reading is None:
             return self._fit(grey, arrival, self._prior)
-        if not reference.usable(reading)[0]:
+        if not reference.usable(reading):
             frame = self._prepared(grey)
             for state in self._guesses():
                 found = self._relocate(reference, grey, frame, state)
                 if found is not None:
                     self._reference, close = found
-                    self._accept(self._reference, close, [self._arrivals.clock])
+                    self._accept(self._reference, close, self._arrivals.clock)
                     flags = Flag.REFITTED | arrival | _changes(reference, reading)
                     return self._reference.pose(close, flags)
         return self._fit(grey, arrival, self._expected())
@@ -406,7 +400,7 @@ class Tracker:
         if self._last is None:
             return
         reference, reading = self._last
-        step = reading.steps[0].copy()
+        step = reading.step.copy()
         predicted = self._motion.predict(self._arrivals.clock)
         if predicted is not None:
             ahead = step.copy()
@@ -425,12 +419,12 @@ class Tracker:
         if near is None:
             return None
         try:
-            moved = reference.moved_to(build(settings, near))
+            moved = reference.moved_to(linearise(settings, near))
         except ValueError:
             return None
         self.references += 1
-        reading = moved.read([grey])
-        return (moved, reading) if moved.fits(reading)[0] else None
+        (reading,) = moved.read([grey])
+        return (moved, reading) if moved.fits(reading) else None
 
     def _expected(self) -> Pose | None:
         """The last pose that was tracked, moved to where the mask should be now."""
@@ -471,7 +465,7 @@ class Tracker:
         except ValueError:  # a pose at the edge of what can be modelled
             return
         self.references += 1
-        if not reference.usable(reading)[0]:
+        if not reference.usable(reading):
             return
         self._reference, self._last = reference, (reference, reading)
         self._odd = 0
@@ -491,7 +485,7 @@ class Tracker:
             self._shape = array.shape
         if array.shape != self._shape or array.dtype.kind not in "uif":
             return None
-        if array.dtype.name not in _AS_STORED:
+        if array.dtype not in _AS_STORED:
             fits = array.dtype.kind in "iu" and array.min() >= 0 and array.max() < 2**16
             array = array.astype(np.uint16 if fits else np.float32)
         if array.dtype.kind == "f" and not np.isfinite(array.sum()):
@@ -510,8 +504,8 @@ def _distance(step: NDArray[np.float64]) -> float:
 
 def _changes(reference: Reference, reading: Reading) -> Flag:
     """Why a frame was out of a reference's range."""
-    flags = Flag.LIGHT_CHANGED if reference.light_changed(reading)[0] else Flag.NONE
-    return flags | (Flag.MOVED if not reference.motion(reading)[0] < USABLE else Flag.NONE)
+    flags = Flag.LIGHT_CHANGED if reference.light_changed(reading) else Flag.NONE
+    return flags | (Flag.MOVED if not reference.motion(reading) < USABLE else Flag.NONE)
 
 
 def _changes_of(reference: Reference, pose: Pose) -> Flag:
