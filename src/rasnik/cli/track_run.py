@@ -231,6 +231,8 @@ class _Run:
         while chunk := list(islice(frames, size)):
             numbers = range(number, number + len(chunk))
             images, reasons = _images(chunk, numbers, options.system)
+            if begun is None and images[0] is not None:
+                _compile(images[0], options.system)
             block = _track(tracker, images, options.times(numbers), numbers, reasons)
             with stop.held():
                 if self._writer is not None:
@@ -248,6 +250,15 @@ class _Run:
                 begun = self.done, now_s
             else:
                 self.frames_per_s = (self.done - begun[0]) / max(now_s - begun[1], 1e-9)
+
+
+def _compile(image: NDArray[Any], system: System) -> None:
+    """What the first start on a machine takes long for."""
+    from rasnik.tracking import warm_up
+
+    if not warm_up.is_compiled():
+        messages().print("Compiling for this machine; only the first start has to.")
+        warm_up.prepare(image, system)
 
 
 def _images(

@@ -122,7 +122,7 @@ class Reference:
     """When the mask was first seen near this reference, in frames."""
 
     @classmethod
-    def from_fit(cls, frame: Frame, pose: Pose, free: bool) -> tuple[Reference, Reading]:
+    def from_fit(cls, frame: Frame, pose: Pose, free: bool) -> Reference:
         """Linearise about a pose that was fitted to a prepared frame.
 
         Parameters
@@ -132,12 +132,6 @@ class Reference:
             Its full fit.
         free : bool
             Whether richer maps than the pose's may be called for.
-
-        Returns
-        -------
-        reference : Reference
-        reading : Reading
-            Of this frame.
         """
         assert pose.projection is not None and pose.appearance is not None
         state = State(pose.projection, pose.appearance)
@@ -152,11 +146,9 @@ class Reference:
         sigmas = np.sqrt(np.diag(pose.covariance) / np.diag(reference._covariance))
         enlarged = pose.flags & (Flag.MODEL_MISFIT | Flag.NOISE_ESTIMATED)
         reference.growth = np.maximum(sigmas, 1.0) if enlarged else np.ones(4)
-        (reading,) = reference.read([frame.image])
-        reference._settle(reading)
-        return reference, reading
+        return reference
 
-    def _settle(self, reading: Reading) -> None:
+    def expect(self, reading: Reading) -> None:
         """Take the first frame's misfit as what is to be expected of the next."""
         if not np.isfinite(reading.statistics).all():
             return

@@ -461,9 +461,11 @@ class Tracker:
         """Track from a full fit on, if a linearisation about it finds the same."""
         free = self._options["model"] == "auto"
         try:
-            reference, reading = Reference.from_fit(self._prepared(grey), pose, free)
+            reference = Reference.from_fit(self._prepared(grey), pose, free)
         except ValueError:  # a pose at the edge of what can be modelled
             return
+        (reading,) = reference.read([grey])
+        reference.expect(reading)
         self.references += 1
         if not reference.usable(reading):
             return
