@@ -117,8 +117,8 @@ def store(
             for lane in range(TILE * TILE):
                 work[ROOT, lane] *= work[ROOT, lane]
             _to_tile(work[ROOT], weighted[kept], part * TILE, wide)
-        counts[t, 1] = weighted[DARK].sum()
-        counts[t, 2] = weighted[LIGHT].sum()
+        counts[t, 1] = _total(weighted[DARK])
+        counts[t, 2] = _total(weighted[LIGHT])
         scales[t, kept] = _quantise_evenly(weighted[kept], weights[t, kept])
         for s in range(kept):
             scales[t, s] = _quantise(weighted[s], weights[t, s])
@@ -130,7 +130,9 @@ def store(
         for s in range(_N_MODEL):
             for other in range(s, _N_MODEL):
                 if other < kept:
-                    exact = products[t, :, k].sum()
+                    exact = 0.0
+                    for part in range(parts):
+                        exact += products[t, part, k]
                     rounding[t, s, other] -= exact
                     if other != s:
                         rounding[t, other, s] -= exact
@@ -188,6 +190,14 @@ def _largest(values):
 
 
 @_compiled
+def _total(values):
+    total = _ZERO
+    for k in range(values.size):
+        total += values[np.uint32(k)]
+    return total
+
+
+@_compiled
 def _quantise(values, integers):
     """Round to 8-bit integers; returns the value of one unit."""
     unit = _largest(values) / _LARGEST
@@ -226,28 +236,29 @@ def _energy(residual, weights, start, size):
 
 
 @_careful
-def sum_frame(frame, parts, level, weights, scales, sums, energies):
+def sum_frame(pixels, width, parts, level, weights, scales, sums, energies):
     """Residuals times signals, and their weighted squares, summed over each tile.
 
     It stands apart from `estimate` because it is compiled for every type of grey levels.
 
     Parameters
     ----------
-    frame : shape (H, W)
+    pixels : shape (H * W,)
         Grey levels of any type.
-    parts, level, weights, scales
-        As made by `store`.
-    sums : float64, shape (tiles, signals)
+    width, parts : int
+        W, and the width of a tile in units of TILE.
+    level, weights, scales
+        As made by `store`, the first two in one dimension.
+    sums : float64, shape (tiles * signals,)
     energies : float64, shape (tiles,)
     """
-    height, width = frame.shape
-    kept = weights.shape[1]
+    height = pixels.size // width
+    kept = scales.shape[1]
     wide = TILE * parts
     size = TILE * wide
     across = -(-width // wide)
     residual = np.zeros(size, dtype=np.float32)
-    pixels, levels, flat = frame.ravel(), level.ravel(), weights.ravel()
-    for t in range(weights.shape[0]):
+    for t in range(scales.shape[0]):
         row0 = (t // across) * TILE
         column0 = (t % across) * wide
         rows = min(TILE, height - row0)
@@ -256,23 +267,24 @@ def sum_frame(frame, parts, level, weights, scales, sums, energies):
             residual[:] = _ZERO
         for row in range(rows):
             at = np.uint32((row0 + row) * width + column0)
-            _residuals(pixels, at, levels, at, residual, np.uint32(row * wide), columns)
+            _residuals(pixels, at, level, at, residual, np.uint32(row * wide), columns)
         start = t * kept * size
         for s in range(kept - 1):
-            sums[t, s] = scales[t, s] * _dot(residual, flat, np.uint32(start + s * size), size)
+            sums[t * (kept - 1) + s] = scales[t, s] * _dot(
+                residual, weights, np.uint32(start + s * size), size
+            )
         last = np.uint32(start + (kept - 1) * size)
-        energies[t] = scales[t, kept - 1] * _energy(residual, flat, last, size)
+        energies[t] = scales[t, kept - 1] * _energy(residual, weights, last, size)
 
 
 @_careful
 def _apply(matrix, sums, result):
-    """matrix (K, tiles * signals) times sums (tiles, signals)."""
-    flat = sums.ravel()
+    """matrix (K, tiles * signals) times sums (tiles * signals)."""
     for k in range(matrix.shape[0]):
         row = matrix[k]
         total = 0.0
-        for j in range(flat.size):
-            total += row[j] * flat[j]
+        for j in range(sums.size):
+            total += row[j] * sums[j]
         result[k] = total
 
 
@@ -349,7 +361,7 @@ def _refine(
                 total = 0.0
                 for other in range(kept):
                     total += grams[t, s, other] * excess[other]
-                beyond[t, s] = total
+                beyond[t * kept + s] = total
         _apply(matrix, beyond, change)
         moved = 0.0
         for k in range(step.size):
@@ -405,7 +417,7 @@ def estimate(
         chi-square by the pose; what the extra rows yield, squared and summed.
     """
     tiles, kept = grams.shape[0], grams.shape[1]
-    beyond = np.empty((tiles, kept))
+    beyond = np.empty(tiles * kept)
     amplitude = np.zeros(kept)
     excess = np.zeros(kept)
     _apply(matrix, sums, step)
@@ -423,7 +435,7 @@ def estimate(
             total = 0.0
             for other in range(kept):
                 total += grams[t, s, other] * amplitude[other]
-            explained += amplitude[s] * (2.0 * sums[t, s] - total)
+            explained += amplitude[s] * (2.0 * sums[t * kept + s] - total)
             if s < DARK:
                 statistics[POSE_ENERGY] += amplitude[s] * total
         chi2 = energies[t] - explained

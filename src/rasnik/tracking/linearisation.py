@@ -33,7 +33,15 @@ from rasnik.mask import ChessField
 from rasnik.tracking import kernels
 from rasnik.tracking.tiling import Tiling, tiling
 
-__all__ = ["Linearisation", "Settings", "linearise", "linearise_in_parts"]
+__all__ = [
+    "Linearisation",
+    "Settings",
+    "Sums",
+    "estimator",
+    "linearise",
+    "linearise_in_parts",
+    "scene_of",
+]
 
 Matrix = NDArray[np.float64]
 
@@ -94,29 +102,31 @@ def linearise_in_parts(
     tiles : int, optional
         So many tiles are worked on at a time.
     """
-    kurtosis = state.appearance.kurtosis != 0.0
-    scene = make_scene(
-        settings.mask, state.projection, state.appearance, settings.camera, kurtosis_signal=kurtosis
-    )
+    scene = scene_of(settings, state)
     yield None
-    sums = _Sums.over(settings, state, scene)
+    sums = Sums.over(settings, state, scene)
     yield None
     at_once = tiles or sums.tiling.count
     for first in range(0, sums.tiling.count, at_once):
         sums.store(first, min(first + at_once, sums.tiling.count))
         yield None
-    rows, n_model = _parameters(settings, state, kurtosis)
+    yield from estimator(sums)
+
+
+def estimator(sums: Sums) -> Iterator[Linearisation | None]:
+    """From the sums to the linearisation, in pieces as in `linearise_in_parts`."""
+    rows, n_model = _parameters(sums.settings, sums.state)
     response, information = sums.matrices(rows)
     yield None
     gain, covariance = _solve(response, information, n_model)
     yield None
-    within, curvature = sums.within(rows[: POSE_SIZE[settings.model]]), _curvature(sums)
+    within, curvature = sums.within(rows[: POSE_SIZE[sums.settings.model]]), _curvature(sums)
     yield None
     yield _finished(sums, rows, gain, covariance, within, curvature)
 
 
 @dataclass(frozen=True, eq=False)
-class _Sums:
+class Sums:
     """What `kernels.store` works out; see there."""
 
     settings: Settings
@@ -132,7 +142,7 @@ class _Sums:
     counts: NDArray[np.float64]
 
     @classmethod
-    def over(cls, settings: Settings, state: State, scene: model_kernels.Scene) -> _Sums:
+    def over(cls, settings: Settings, state: State, scene: model_kernels.Scene) -> Sums:
         """Room for the sums about a state."""
         camera, (a, b) = settings.camera, settings.noise
         floor = max(a, 1e-3 * b * float(np.ptp(scene.photometry[:, 0])), 1e-12)
@@ -180,9 +190,19 @@ class _Sums:
         return moved @ self.tiling.summed(motion.reshape(-1, 2, 2), self.tiling.spread) @ moved.T
 
 
-def _parameters(settings: Settings, state: State, kurtosis: bool) -> tuple[Matrix, int]:
+def scene_of(settings: Settings, state: State) -> model_kernels.Scene:
+    return make_scene(
+        settings.mask, state.projection, state.appearance, settings.camera,
+        kurtosis_signal=state.appearance.kurtosis != 0.0,
+    )  # fmt: skip
+
+
+def _parameters(settings: Settings, state: State) -> tuple[Matrix, int]:
     """Rows of `design`: those of the model first, then those that only a richer one has."""
-    arguments = (state, settings.camera, settings.mask.field_um)
+    arguments, kurtosis = (
+        (state, settings.camera, settings.mask.field_um),
+        state.appearance.kurtosis != 0.0,
+    )
     rows = design(*arguments, settings.model, kurtosis)
     if not settings.free:
         return rows, len(rows)
@@ -192,7 +212,7 @@ def _parameters(settings: Settings, state: State, kurtosis: bool) -> tuple[Matri
 
 
 def _finished(
-    sums: _Sums, rows: Matrix, gain: Matrix, covariance: Matrix, within: Matrix, curvature: Matrix
+    sums: Sums, rows: Matrix, gain: Matrix, covariance: Matrix, within: Matrix, curvature: Matrix
 ) -> Linearisation:
     """From the sums and the solution to what every frame needs."""
     settings, state, basis = sums.settings, sums.state, sums.tiling.basis
@@ -234,7 +254,7 @@ def _edge_width_fields(settings: Settings, state: State) -> float:
     return float(np.hypot(blur, pixel / np.sqrt(12)) * size / settings.mask.field_um)
 
 
-def _curvature(sums: _Sums) -> Matrix:
+def _curvature(sums: Sums) -> Matrix:
     """What of a motion is not linear, from the edge profiles (see `kernels.estimate`).
 
     With E the profile, E1 and E3 its derivatives and w the weights, a motion d along X is
@@ -349,8 +369,11 @@ class Linearisation:
         statistics : ndarray of float64, shape (kernels.N_STATISTICS,)
             Receives what `kernels.estimate` tells.
         """
-        sums, energies = np.empty(self.grams.shape[:2]), np.empty(len(self.grams))
-        kernels.sum_frame(frame, self.parts, self.level, self.weights, self.scales, sums, energies)
+        sums, energies = np.empty(self.matrix.shape[1]), np.empty(len(self.grams))
+        kernels.sum_frame(
+            frame.ravel(), frame.shape[1], self.parts, self.level.ravel(), self.weights.ravel(),
+            self.scales, sums, energies,
+        )  # fmt: skip
         kernels.estimate(
             sums, energies, self.matrix, POSE_SIZE[self.settings.model], self.lever, self.basis,
             self.contrast, self.units, self.curvature, self.grams, self.within, self.counts,
