@@ -15,7 +15,7 @@ import rasnik
 PACKAGE = Path(rasnik.__file__).parent
 
 # What is printed, what the instrument is, what the image must look like, where it is, how well;
-# then files and screens. Nothing imports from a room to its right, not even inside a function.
+# then files, cameras and screens. Nothing imports from a room to its right, not even inside a function.
 ROOMS = (
     "_config",
     "mask",
@@ -27,6 +27,11 @@ ROOMS = (
     "performance",
     "characterisation",
     "io",
+    "cameras",
+    "recording",
+    "live",
+    "controls",
+    "web",
     "report",
     "paper",
     "cli",
@@ -36,7 +41,10 @@ ROOMS = (
 EXCEPTIONS: dict[tuple[str, str], str] = {}
 
 # Imports that take long or need an optional package; each is loaded where it is used.
-HEAVY = {"matplotlib", "h5py", "pyarrow", "numba", "PIL", "tifffile", "scipy", "gdstk", "ezdxf"}
+HEAVY = {
+    *("matplotlib", "h5py", "pyarrow", "numba", "PIL", "tifffile", "scipy", "gdstk", "ezdxf"),
+    *("gi", "cv2", "starlette", "uvicorn", "softioc", "p4p", "paho", "prometheus_client", "psutil"),
+}
 
 
 def module_name(path: Path) -> str:

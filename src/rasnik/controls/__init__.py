@@ -1,0 +1,1 @@
+"""Values for control systems: EPICS, MQTT, Prometheus."""

@@ -1,0 +1,1 @@
+"""From cameras to poses that others can see, as they come."""

@@ -1,0 +1,169 @@
+"""A station: its cameras, what is recorded, who may look; one TOML file describes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from rasnik._config import SystemConfigError, read_toml, sentences
+from rasnik.cameras.camera import CameraSettings
+from rasnik.recording.options import Recording
+
+__all__ = [
+    "Alarms",
+    "CameraConfig",
+    "ChannelConfig",
+    "Controls",
+    "Epics",
+    "Mqtt",
+    "Prometheus",
+    "Server",
+    "StationConfig",
+    "load_station",
+]
+
+_Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,39}$")]
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+
+
+class CameraConfig(_Part):
+    """Where the frames of a channel come from, and the camera's settings."""
+
+    kind: Literal["simulated", "replay", "aravis", "opencv"] = "simulated"
+    device: str = Field(
+        default="", description="aravis: serial number, name or address; opencv: number or path"
+    )
+    source: list[str] = Field(default=[], description="replay: folders, stacks, videos")
+    pace: Literal["original", "full"] = Field(default="original", description="replay")
+    repeat: bool = Field(default=False, description="replay: from the beginning again at its end")
+    motion_um: float = Field(default=2.0, ge=0, description="simulated: amplitude of the motion")
+    motion_hz: float = Field(default=0.3, gt=0, description="simulated: its frequency")
+    seed: int = Field(default=0, ge=0, description="simulated")
+    frame_rate_hz: float | None = Field(default=None, gt=0)
+    exposure_us: float | None = Field(default=None, gt=0)
+    gain_db: float | None = None
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] | None = None
+    region: tuple[int, int, int, int] | None = Field(
+        default=None, description="left, top, width, height"
+    )
+    trigger: str | None = Field(default=None, description='"free" or the name of an input')
+    packet_bytes: int | None = Field(default=None, ge=576, le=16384)
+    keep_exposure: bool = Field(
+        default=False, description="keep the brightest fields just below full scale"
+    )
+
+    @property
+    def settings(self) -> CameraSettings:
+        return CameraSettings(
+            self.frame_rate_hz, self.exposure_us, self.gain_db, self.pixel_format, self.region,
+            self.trigger, self.packet_bytes,
+        )  # fmt: skip
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        if self.kind == "replay" and not self.source:
+            raise ValueError("a replay needs a source: folders, stacks or videos")
+        return self
+
+
+class Alarms(_Part):
+    """Limits; beyond them a channel is in alarm. Positions count from its zero."""
+
+    x_um: tuple[float, float] | None = None
+    y_um: tuple[float, float] | None = None
+    scale: tuple[float, float] | None = None
+    theta_mrad: tuple[float, float] | None = None
+    chi2_ndf: tuple[float, float] | None = None
+    frame_rate_hz: tuple[float, float] | None = None
+    lost_percent: float | None = Field(default=1.0, ge=0, description="of the last 10 s")
+    unlocked_s: float | None = Field(default=1.0, ge=0, description="without a position")
+
+
+class ChannelConfig(_Part):
+    """One Rasnik: a system, a camera, and what is done with its poses."""
+
+    name: _Name
+    system: str = Field(default="solidras", description="name or TOML file of the system")
+    orientation: int | None = Field(default=None, ge=1, le=4)
+    model: Literal["auto", "similarity", "affine", "projective"] = "auto"
+    camera: CameraConfig = CameraConfig()
+    recording: Recording = Recording()
+    alarms: Alarms = Alarms()
+
+
+class Server(_Part):
+    """Who may look."""
+
+    host: str = Field(default="127.0.0.1", description="address to listen on")
+    port: int = Field(default=8080, ge=0, le=65535)
+    token_file: Path | None = Field(default=None, description="needed for any other address")
+
+
+class Epics(_Part):
+    """Process variables, by Channel Access and PV Access."""
+
+    enabled: bool = False
+    prefix: str = Field(default="RASNIK", pattern=r"^[A-Za-z0-9_:-]{1,40}$")
+    rate_hz: float = Field(default=10.0, gt=0, le=100)
+
+
+class Mqtt(_Part):
+    """Messages to a broker."""
+
+    enabled: bool = False
+    host: str = "localhost"
+    port: int = Field(default=1883, ge=1, le=65535)
+    topic: str = Field(default="rasnik", min_length=1)
+    username: str | None = None
+    password_file: Path | None = None
+    rate_hz: float = Field(default=1.0, gt=0, le=100)
+
+
+class Prometheus(_Part):
+    """Metrics at /metrics."""
+
+    enabled: bool = True
+
+
+class Controls(_Part):
+    epics: Epics = Epics()
+    mqtt: Mqtt = Mqtt()
+    prometheus: Prometheus = Prometheus()
+
+
+class StationConfig(_Part):
+    """An installation."""
+
+    name: _Name = "rasnik"
+    folder: Path = Field(default=Path("rasnik-data"), description="where recordings go")
+    server: Server = Server()
+    controls: Controls = Controls()
+    channel: list[ChannelConfig] = Field(default=[ChannelConfig(name="simulated")], min_length=1)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        names = [channel.name for channel in self.channel]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"channels need different names; twice: {', '.join(twice)}")
+        return self
+
+
+def load_station(path: Path) -> StationConfig:
+    """Read a station file. Relative paths in it count from its folder.
+
+    Raises
+    ------
+    SystemConfigError
+        With one sentence for each fault.
+    """
+    data: dict[str, Any] = read_toml(path)
+    try:
+        return StationConfig.model_validate(data)
+    except ValidationError as error:
+        raise SystemConfigError(str(path), sentences(StationConfig, error)) from None

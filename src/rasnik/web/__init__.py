@@ -1,0 +1,1 @@
+"""The page to look at, and the interface for programs behind it."""
