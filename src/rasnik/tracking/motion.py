@@ -28,9 +28,6 @@ class Motion:
             self._last.clear()
         self._last.append((time, pose))
 
-    def forget(self) -> None:
-        self._last.clear()
-
     def predict(self, time: float) -> NDArray[np.float64] | None:
         """The pose at a time, shape (4,); None if there is nothing to extrapolate from."""
         if not self._last or time - self._last[-1][0] > _LONGEST_GAP:
@@ -42,11 +39,3 @@ class Motion:
             others = np.delete(times, k)
             weights[k] = np.prod((ahead - others) / (own - others))
         return np.array([pose for _, pose in self._last]).T @ weights
-
-    @property
-    def velocity(self) -> NDArray[np.float64]:
-        """Change per frame between the last two poses, shape (4,)."""
-        if len(self._last) < 2:
-            return np.zeros(4)
-        (t0, before), (t1, after) = self._last[-2], self._last[-1]
-        return (after - before) / (t1 - t0)

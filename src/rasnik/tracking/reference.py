@@ -118,8 +118,8 @@ class Reference:
     growth: NDArray[np.float64] = field(default_factory=lambda: np.ones(4))
     chi2_ratio: float = 1.0
     surprise: NDArray[np.float64] | None = None
-    begun: float | None = None
-    """When the mask was first seen near this reference, in frames."""
+    begun: tuple[float, NDArray[np.float64]] | None = None
+    """When the mask was first seen near this reference, in frames, and the step to it."""
 
     @classmethod
     def from_fit(cls, frame: Frame, pose: Pose, free: bool) -> Reference:
@@ -227,6 +227,19 @@ class Reference:
     def learn(self, reading: Reading) -> None:
         """Follow slow changes of the misfit with a frame that was believed."""
         self.chi2_ratio += (reading.chi2_ratio - self.chi2_ratio) / _AVERAGED
+
+    def velocity(self, reading: Reading, clock: float) -> NDArray[np.float64]:
+        """Mean change of the pose per frame since this reference came into use, shape (4,)."""
+        if self.begun is None or self.begun[0] == clock:
+            return np.zeros(4)
+        begun, step = self.begun
+        return (reading.step[:4] - step) / (clock - begun)
+
+    def ahead(self, reading: Reading, clock: float, frames: float) -> State:
+        """Where the mask will be a number of frames after a reading."""
+        step = reading.step.copy()
+        step[:4] += frames * self.velocity(reading, clock)
+        return self.linear.stepped(step)
 
     @property
     def near_um(self) -> float:

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import count, islice
-from math import ceil
 from typing import Any, Literal
 
 import numpy as np
@@ -26,7 +25,7 @@ from rasnik.analysis.parameters import POSE_SIZE, Model, State
 from rasnik.analysis.pose import Pose
 from rasnik.instrument import System
 from rasnik.tracking.arrival import Arrivals
-from rasnik.tracking.linearisation import Linearisation, linearise, linearise_in_parts
+from rasnik.tracking.linearisation import linearise
 from rasnik.tracking.motion import Motion
 from rasnik.tracking.reference import (
     LIGHT_USABLE,
@@ -37,17 +36,13 @@ from rasnik.tracking.reference import (
     approach,
     model_of,
 )
-from rasnik.tracking.tiling import tiling
+from rasnik.tracking.renewal import Renewal
 from rasnik.tracking.track import POSE_COLUMNS, TRACK_COLUMNS, Track
 
 __all__ = ["Tracker"]
 
 Image = NDArray[Any]
 
-_WORK_S = 0.12  # of a stream, over which the work on a new reference is spread
-_STEPS = 6  # of that work beside those on tiles
-_EARLY = 0.5  # of the range of a reference: where a stream begins to work on the next
-_SOON = 32  # frames; a reference that lasts as long need not be set ahead
 _NO_OTHER = 20  # times the range of a reference: guesses so close lead to the same place
 _PATIENCE = 3  # frames with something in the way before that is taken as lasting
 _MORE_MASKED = 5e-4
@@ -110,9 +105,8 @@ class Tracker:
         self._prior = prior
         self._reference: Reference | None = None
         self._last: tuple[Reference, Reading] | None = None  # that fitted
-        self._work: Iterator[Linearisation | None] | None = None
+        self._renewal = Renewal()
         self._motion = Motion()
-        self._began_at = np.zeros(4)  # the step when the reference came into use
         self._ask_after, self._ask_at = _ASKED_AFTER, 0.0  # frames, whether less would do
         self._odd = 0  # frames in a row that a fit explained less well
         self._at_once = _MOST_AT_ONCE
@@ -154,7 +148,7 @@ class Tracker:
         if not reference.fits(reading):
             return self._recover(grey, reading, arrival)
         self._accept(reference, reading, self._arrivals.clock)
-        self._work_ahead(reference, reading)
+        self._change_to(self._renewal.in_parts(reference, reading, self._arrivals))
         self._reconsider(grey)
         return reference.pose(reading, arrival)
 
@@ -283,7 +277,7 @@ class Tracker:
         for name, values in reference.columns(readings).items():
             columns[name][rows.start : rows.start + n] = values
         if not reference.near(readings[-1]):
-            self._follow(reference, readings[-1])
+            self._change_to(self._renewal.at_once(reference, readings[-1], self._arrivals.clock))
         self._reconsider(batch[n - 1])
         return n
 
@@ -291,69 +285,14 @@ class Tracker:
         """Learn from a frame that fits."""
         reference.learn(reading)
         if reference.begun is None:
-            reference.begun, self._began_at = clock, reading.step[:4]
+            reference.begun = clock, reading.step[:4]
         self._motion.add(clock, reference.vector + reading.step[:4])
         self._last = reference, reading
         self._odd = 0
 
-    # ----------------------------------------------------------------- new references
-
-    def _follow(self, reference: Reference, reading: Reading) -> None:
-        """A new reference where the mask is, or ahead of it if it moves fast."""
-        velocity = self._velocity(reference, reading)
-        speed = _distance(velocity)
-        fast = speed > reference.near_um / _SOON
-        self._replace(reference, reading, 0.7 * reference.near_um / speed if fast else 0.0)
-
-    def _velocity(self, reference: Reference, reading: Reading) -> NDArray[np.float64]:
-        """Mean change of the pose per frame since the reference came into use, shape (4,)."""
-        if reference.begun is None or reference.begun == self._arrivals.clock:
-            return np.zeros(4)
-        return (reading.step[:4] - self._began_at) / (self._arrivals.clock - reference.begun)
-
-    def _ahead(self, reference: Reference, reading: Reading, frames: float) -> State:
-        step = reading.step.copy()
-        step[:4] += frames * self._velocity(reference, reading)
-        return reference.linear.stepped(step)
-
-    def _replace(self, reference: Reference, reading: Reading, frames: float) -> None:
-        state = self._ahead(reference, reading, frames)
-        self._work = None
-        try:
-            self._reference = reference.moved_to(linearise(reference.linear.settings, state))
-        except ValueError:  # a state that cannot be modelled; the next frame decides
-            return
-        self.references += 1
-
-    def _work_ahead(self, reference: Reference, reading: Reading) -> None:
-        """A part of the work on a new reference, in a stream that must not wait."""
-        period = self._arrivals.period_s
-        share = 1 / _SOON if np.isnan(period) else min(period / _WORK_S, 1.0)  # of the work
-        if self._work is None:
-            # early, as the mask moves on while the work is done
-            if not reference.near(reading) or reference.motion(reading) > _EARLY * NEAR:
-                state = self._ahead(reference, reading, 1 / share)
-                settings = reference.linear.settings
-                tiles = ceil(share * tiling(settings.camera).count)
-                self._work = linearise_in_parts(settings, state, tiles)
-            return
-        for _ in range(ceil(share * _STEPS)):
-            try:
-                linear = next(self._work)
-            except ValueError:  # a state that cannot be modelled
-                self._work = None
-                return
-            if linear is not None:
-                self._work = None
-                self._change_to(reference.moved_to(linear), reading)
-                return
-
-    def _change_to(self, moved: Reference, reading: Reading) -> None:
-        """Take a new reference if the mask is nearer to it than to the present one."""
-        assert self._reference is not None
-        step = reading.step[:4]
-        if _distance(self._reference.vector + step - moved.vector) < _distance(step):
-            self._reference = moved
+    def _change_to(self, reference: Reference | None) -> None:
+        if reference is not None:
+            self._reference = reference
             self.references += 1
 
     def _reconsider(self, grey: Image) -> None:
@@ -380,7 +319,7 @@ class Tracker:
 
     def _recover(self, grey: Image, reading: Reading | None, arrival: Flag) -> Pose:
         """First a new reference where the mask seems to be, then a full fit."""
-        self._work = None
+        self._renewal.stop()
         reference = self._reference
         if reference is None or reading is None:
             return self._fit(grey, arrival, self._prior)
