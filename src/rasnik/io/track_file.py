@@ -7,7 +7,7 @@ import math
 import os
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from types import TracebackType
@@ -20,8 +20,15 @@ from rasnik.instrument import System
 from rasnik.io.file_lock import FileLock
 from rasnik.io.hdf5 import append_rows
 from rasnik.io.results import file_metadata
-from rasnik.io.track_table import MOST_ROWS, ROW, TABLE, TABLE_ATTRIBUTES, create_table, reopened
-from rasnik.tracking.track import Track
+from rasnik.io.track_table import (
+    MOST_ROWS,
+    TABLE,
+    TABLE_ATTRIBUTES,
+    create_table,
+    reopened,
+    row_type,
+)
+from rasnik.tracking.track import Track, TrackColumn
 
 __all__ = ["HDF5_SUFFIXES", "TrackWriter", "track_metadata"]
 
@@ -61,6 +68,8 @@ class TrackWriter:
         such a file a new one is begun.
     flush_s : float
         Longest time between `write` and the file. With 0 every `write` waits for it.
+    extra : sequence of TrackColumn
+        Columns stored after those of a track; `write` takes their values.
 
     Raises
     ------
@@ -87,6 +96,7 @@ class TrackWriter:
         metadata: Mapping[str, str] | None = None,
         resume: bool = False,
         flush_s: float = 1.0,
+        extra: Sequence[TrackColumn] = (),
     ) -> None:
         self.path = Path(path)
         if self.path.suffix.lower() not in HDF5_SUFFIXES:
@@ -103,14 +113,16 @@ class TrackWriter:
         self._wait_s = flush_s / 2
         if not self.path.exists():
             about.setdefault("start_time_utc", datetime.now(UTC).isoformat(timespec="milliseconds"))
-            create_table(self.path, about)
+            create_table(self.path, about, extra)
         self._lock = FileLock(self.path)
         try:
-            self._file, self._rows, self._next_frame = reopened(self.path, about)
+            self._file, self._rows, self._next_frame = reopened(self.path, about, extra)
         except BaseException:
             self._lock.release()
             raise
         self._lock.share()
+        self._row_type = row_type(extra)
+        self._extra = [column.name for column in extra]
         self._pending: list[NDArray[Any]] = []
         self._pending_rows = 0
         self._pending_since = 0.0
@@ -133,19 +145,30 @@ class TrackWriter:
         """Number of the last frame written + 1; 0 for a new file."""
         return self._next_frame
 
-    def write(self, track: Track) -> None:
+    def write(self, track: Track, extra: Mapping[str, NDArray[Any]] | None = None) -> None:
         """Append the rows of a track; its metadata are not looked at.
+
+        Parameters
+        ----------
+        track : Track
+        extra : mapping of str to ndarray, shape (n,)
+            Values of the further columns of the file, all of them.
 
         Raises
         ------
         ValueError
             If the numbers of the frames do not increase from row to row, those written before
-            included, or the file is closed.
+            included, the further columns are not those of the file, or the file is closed.
         OSError
             If rows could not be stored, these or earlier ones.
         """
-        rows = np.empty(len(track), dtype=ROW)
-        for name, values in track.as_dict().items():
+        if set(extra or ()) != set(self._extra):
+            raise ValueError(
+                f"{self.path}: the columns {', '.join(self._extra) or '(none)'} are needed beside "
+                f"those of a track, not {', '.join(extra or ()) or '(none)'}"
+            )
+        rows = np.empty(len(track), dtype=self._row_type)
+        for name, values in {**track.as_dict(), **(extra or {})}.items():
             rows[name] = values
         with self._changed:
             if self._closed:

@@ -2,12 +2,12 @@
 
 ``/track``
     Compound table with one row for each frame; the columns are those of
-    `rasnik.tracking.track.TRACK_COLUMNS`. A row is written as a whole, so columns never differ in
-    length. Numbers of frames increase from row to row. Attributes: ``format`` and
-    ``format_version``; ``columns``, ``units``, ``descriptions``; ``flag_masks`` and
-    ``flag_meanings`` for the integer column ``flags``; ``conventions``, ``software`` and
-    ``system_toml``; ``start_time_utc``; where known ``source`` and ``frame_rate_hz``; further
-    texts as given.
+    `rasnik.tracking.track.TRACK_COLUMNS`, and perhaps more after them. A row is written as a
+    whole, so columns never differ in length. Numbers of frames increase from row to row.
+    Attributes: ``format`` and ``format_version``; ``columns``, ``units``, ``descriptions``;
+    ``flag_masks`` and ``flag_meanings`` for the integer column ``flags``; ``conventions``,
+    ``software`` and ``system_toml``; ``start_time_utc``; where known ``source`` and
+    ``frame_rate_hz``; further texts as given.
 
 The rows are not compressed: a part of a chunk that is written again in compressed form takes a
 new place in the file, and a file flushed every second would hold most rows many times.
@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import time
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from rasnik._config import parse_overrides
 from rasnik.instrument import System
 from rasnik.io.hdf5 import describe_table
 from rasnik.io.hdf5_repair import clear_write_marks
-from rasnik.tracking.track import TRACK_COLUMNS, Track
+from rasnik.tracking.track import TRACK_COLUMNS, Track, TrackColumn
 
 __all__ = [
     "MOST_ROWS",
@@ -40,15 +40,24 @@ __all__ = [
     "TABLE_ATTRIBUTES",
     "create_table",
     "from_rows",
+    "read_rows",
     "read_table",
     "reopened",
+    "row_type",
 ]
 
 _FORMAT = "rasnik track"
 _VERSION = 1
 TABLE = "track"
-#: One row, as it is stored.
-ROW = np.dtype([(column.name, column.dtype) for column in TRACK_COLUMNS])
+
+
+def row_type(extra: Sequence[TrackColumn] = ()) -> np.dtype[Any]:
+    """One row, as it is stored."""
+    return np.dtype([(column.name, column.dtype) for column in (*TRACK_COLUMNS, *extra)])
+
+
+#: A row of a track without further columns.
+ROW = row_type()
 _CHUNK_ROWS = 1024
 #: No more rows than these are appended at a time.
 MOST_ROWS = 65_536
@@ -63,24 +72,33 @@ TABLE_ATTRIBUTES = {
 # ------------------------------------------------------------------------ making and continuing
 
 
-def create_table(path: Path, metadata: Mapping[str, str]) -> None:
+def create_table(
+    path: Path, metadata: Mapping[str, str], extra: Sequence[TrackColumn] = ()
+) -> None:
     """A file without rows. It gets its name once it is complete: a kill leaves no half of it."""
     unfinished = path.with_name(path.name + ".new")
-    with h5py.File(unfinished, "w", libver=_LIBVER, locking=False) as file:
-        table = file.create_dataset(
-            TABLE,
-            shape=(0,),
-            maxshape=(None,),
-            dtype=ROW,
-            chunks=(_CHUNK_ROWS,),
-            fillvalue=np.array((-1, *(0,) * (len(TRACK_COLUMNS) - 1)), dtype=ROW),
-        )
-        attributes = {"format": _FORMAT, "format_version": _VERSION, **metadata}
-        describe_table(table, TRACK_COLUMNS, attributes)
-    unfinished.replace(path)
+    columns, row = (*TRACK_COLUMNS, *extra), row_type(extra)
+    try:
+        with h5py.File(unfinished, "w", libver=_LIBVER, locking=False) as file:
+            table = file.create_dataset(
+                TABLE,
+                shape=(0,),
+                maxshape=(None,),
+                dtype=row,
+                chunks=(_CHUNK_ROWS,),
+                fillvalue=np.array((-1, *(0,) * (len(columns) - 1)), dtype=row),
+            )
+            attributes = {"format": _FORMAT, "format_version": _VERSION, **metadata}
+            describe_table(table, columns, attributes)
+        unfinished.replace(path)
+    except BaseException:
+        unfinished.unlink(missing_ok=True)
+        raise
 
 
-def reopened(path: Path, metadata: Mapping[str, str]) -> tuple[h5py.File, int, int]:
+def reopened(
+    path: Path, metadata: Mapping[str, str], extra: Sequence[TrackColumn] = ()
+) -> tuple[h5py.File, int, int]:
     """(file in SWMR mode, rows, next frame) of a file to append to, repaired if need be."""
     try:
         stored = read_table(path, start=-1).metadata
@@ -91,10 +109,10 @@ def reopened(path: Path, metadata: Mapping[str, str]) -> tuple[h5py.File, int, i
     clear_write_marks(path)
     with h5py.File(path, "r", locking=False) as file:
         table = file[TABLE]
-        if table.dtype != ROW:
+        if table.dtype != row_type(extra):
             raise ValueError(
-                f"{path}: the columns are those of another version of this program; "
-                "begin a new file"
+                f"{path}: the columns are others than those to be written, or of another "
+                "version of this program; begin a new file"
             )
         announced = len(table)
         first = max(0, announced - 4 * MOST_ROWS)  # more rows than are stored at a time
@@ -179,6 +197,27 @@ def _system_differences(stored: str, given: str) -> list[str]:
 
 def read_table(path: Path, start: int | None = None, stop: int | None = None) -> Track:
     """The rows of a file by `TrackWriter`, also one that is being written; see `read_track`."""
+    return from_rows(*read_rows(path, start, stop))
+
+
+def read_rows(
+    path: Path, start: int | None = None, stop: int | None = None
+) -> tuple[NDArray[Any], dict[str, str]]:
+    """Rows of a file with all of their columns, and its metadata; see `read_track`.
+
+    Parameters
+    ----------
+    path : Path
+        A file by `TrackWriter`, also one that is being written or whose writer was killed.
+    start, stop : int, optional
+        Rows as in ``rows[start:stop]``.
+
+    Returns
+    -------
+    rows : ndarray
+        Structured, with the columns of a track and those that the writer added.
+    metadata : dict of str
+    """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: there is no such file")
     with _for_reading(path) as file:
@@ -186,7 +225,7 @@ def read_table(path: Path, start: int | None = None, stop: int | None = None) ->
             rows, metadata = _content(path, file, start, stop)
         except (OSError, RuntimeError, KeyError) as error:
             raise OSError(f"{path}: the file is damaged or incomplete ({error})") from error
-    return from_rows(rows[: _whole_rows(rows["frame"])], metadata)
+    return rows[: _whole_rows(rows["frame"])], metadata
 
 
 def _content(
@@ -228,7 +267,7 @@ def _check_complete(path: Path, table: h5py.Dataset, rows: int) -> None:
 
 
 def from_rows(rows: NDArray[Any], metadata: Mapping[str, str] | None = None) -> Track:
-    """A track from a structured array of type `ROW`."""
+    """A track from a structured array that has the columns of `ROW`."""
     columns: dict[str, Any] = {column.name: rows[column.name] for column in TRACK_COLUMNS}
     return Track(**columns, metadata=metadata or {})
 

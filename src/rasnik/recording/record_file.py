@@ -1,0 +1,176 @@
+"""Where the rows of a channel go: one file after the other, whatever the disk does."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rasnik.instrument import System
+from rasnik.io.track_file import TrackWriter
+from rasnik.io.track_table import from_rows
+from rasnik.recording.options import Recording
+from rasnik.recording.rows import RECORD_COLUMNS
+
+__all__ = ["DiskError", "RecordFiles", "free_mib", "name_time", "new_name", "record_files"]
+
+_MIB = 1 << 20
+_SPARE_MIB = 1.0  # for what a file needs beside its rows
+_PATIENCE_S = 30.0  # longest time between attempts with a disk that fails
+
+
+class DiskError(Exception):
+    """Rows cannot be stored now; the message is a sentence with its remedy."""
+
+
+def free_mib(folder: Path) -> float:
+    """Space that is left on the disk of a folder."""
+    return shutil.disk_usage(folder).free / _MIB
+
+
+def new_name(folder: Path, channel: str, time_s: float, suffix: str) -> Path:
+    """CHANNEL_YYYYmmddTHHMMSSZ and the suffix, with a number if the name is taken."""
+    stem = f"{channel}_{datetime.fromtimestamp(time_s, UTC):%Y%m%dT%H%M%SZ}"
+    path, number = folder / f"{stem}{suffix}", 1
+    while path.exists():
+        number += 1
+        path = folder / f"{stem}_{number}{suffix}"
+    return path
+
+
+def name_time(path: Path) -> tuple[str, int]:
+    """What record files are sorted by: the time in the name, and the number after it."""
+    match = re.search(r"_(\d{8}T\d{6}Z)(?:_(\d+))?\.h5$", path.name)
+    return (match[1], int(match[2] or 1)) if match else ("", 0)
+
+
+def record_files(folder: Path) -> list[Path]:
+    """The record files of a channel's folder, oldest first."""
+    return sorted((p for p in folder.glob("*.h5") if name_time(p)[0]), key=name_time)
+
+
+class RecordFiles:
+    """Writes rows into files that are rotated; used by one thread.
+
+    A file that cannot be written is left as it is, and a new one is begun once there is space.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the channel; made if need be.
+    channel : str
+    system : System
+    options : Recording
+    metadata : mapping of str to str
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        channel: str,
+        system: System,
+        options: Recording,
+        metadata: Mapping[str, str],
+    ) -> None:
+        self.folder, self.channel = folder, channel
+        self._system, self._options, self._metadata = system, options, metadata
+        self._writer: TrackWriter | None = None
+        self._began_s = 0.0
+        self._failures = 0
+        self._again_s = 0.0
+        self._trouble = ""
+        self.path: Path | None = None
+
+    @property
+    def is_closed(self) -> bool:
+        return self._writer is None
+
+    def write(self, rows: NDArray[Any]) -> int:
+        """Store rows; the number of the first of them in the file.
+
+        Raises
+        ------
+        DiskError
+            If none of the rows could be stored for certain; they are to be given again.
+        """
+        if time.monotonic() < self._again_s:
+            raise DiskError(self._trouble)
+        try:
+            self._check_space(rows.nbytes)
+            writer = self._ready(rows)
+            first = writer.rows
+            columns = {column.name: rows[column.name] for column in RECORD_COLUMNS}
+            writer.write(from_rows(rows), columns)
+        except (OSError, RuntimeError) as error:
+            self._fail(error)
+        self._failures = 0
+        return first
+
+    def sync(self) -> None:
+        """Ask the disk to have what was written."""
+        if self._writer is not None:
+            try:
+                self._writer.flush()
+            except (OSError, RuntimeError) as error:
+                self._fail(error)
+
+    def close(self) -> None:
+        """End the current file; the next rows begin a new one."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        try:
+            writer.close()
+        except (OSError, RuntimeError):
+            pass  # its rows were stored, or are kept and go to the next file
+        if writer.rows == 0:
+            writer.path.unlink(missing_ok=True)
+
+    def _check_space(self, size: int) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        free, least = free_mib(self.folder), self._options.keep_free_mib
+        if free < max(least, _SPARE_MIB + size / _MIB):
+            raise DiskError(
+                f"the disk is full: {free:.1f} MiB are free at {self.folder}, and recording keeps "
+                f"{least:g} MiB free; make space, and it goes on by itself"
+            )
+
+    def _ready(self, rows: NDArray[Any]) -> TrackWriter:
+        """The file for these rows, a new one if it is time for that."""
+        writer, options = self._writer, self._options
+        if writer is not None and (
+            time.monotonic() - self._began_s > options.rotate_hours * 3600
+            or writer.rows * rows.itemsize > options.rotate_mib * _MIB
+            or rows["frame"][0] < writer.next_frame
+        ):
+            self.close()
+            writer = None
+        if writer is None:
+            first_s = float(rows["host_time_s"][0])
+            began = first_s if np.isfinite(first_s) and first_s > 0 else time.time()
+            self.path = new_name(self.folder, self.channel, began, ".h5")
+            start = datetime.fromtimestamp(began, UTC).isoformat(timespec="milliseconds")
+            writer = self._writer = TrackWriter(
+                self.path,
+                system=self._system,
+                metadata={"source": self.channel, "start_time_utc": start, **self._metadata},
+                flush_s=0.0,
+                extra=RECORD_COLUMNS,
+            )
+            self._began_s = time.monotonic()
+        return writer
+
+    def _fail(self, error: Exception) -> None:
+        """Give up the current file, and wait longer each time before the next."""
+        self.close()
+        self._failures += 1
+        self._again_s = time.monotonic() + min(2.0 ** (self._failures - 1), _PATIENCE_S)
+        self._trouble = f"rows cannot be stored ({error}); the next attempt follows by itself"
+        raise DiskError(self._trouble) from error
