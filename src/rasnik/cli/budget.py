@@ -4,25 +4,18 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rasnik.cli.common import fail, load, output
+from rasnik.cli.files import PlotOption, written
 from rasnik.cli.predict import PoseOption, SetOption, SystemArgument, pose_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from rasnik.performance.budget import Budget
 
-__all__ = ["PlotOption", "budget_command", "written"]
-
-PlotOption = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", metavar="FILE", help="Plot: .png, .pdf or .svg."),
-]
+__all__ = ["budget_command"]
 
 
 def budget_command(
@@ -86,18 +79,6 @@ def budget_command(
         from rasnik.report.budget import draw_budget
 
         written(plot, lambda: draw_budget(found, plot), quiet=as_json)
-
-
-def written(path: Path, draw: Callable[[], None], quiet: bool = False) -> None:
-    """Draw a plot into a file, and say so or why not."""
-    try:
-        draw()
-    except OSError as error:
-        fail(f"{path} cannot be written: {error.strerror or error}.")
-    except ValueError as error:  # a format that is not known
-        fail(f"{path} cannot be written: {error}.")
-    if not quiet:
-        output().print(f"written: {path}", markup=False)
 
 
 def _print(found: Budget) -> None:

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rasnik.cli.analyse import check_instrument, parse_bounds
-from rasnik.cli.budget import written
 from rasnik.cli.common import fail, load, messages, output
-from rasnik.cli.resolution import check_outputs, save_json, stored_track, system_for
+from rasnik.cli.files import check_outputs, save_json, stored_track, system_for, written
 
 if TYPE_CHECKING:
     from rasnik.characterisation.edges import Edges
@@ -108,7 +107,7 @@ def edges_command(
     track = stored_track(images[0]) if len(images) == 1 else None
     if track is not None:
         system = None if system_name is None else load(system_name, overrides or ())
-        system = system or system_for(track, overrides or [])
+        system = system or system_for(images[0], track, overrides or [])
         _of_track(track, system, best_blur_um, files, as_json, images[0])
         return
     check_instrument(system_name, overrides, field_um, pixel_um)

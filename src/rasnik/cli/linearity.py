@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rasnik.cli.budget import written
 from rasnik.cli.common import fail, load, messages, output
-from rasnik.cli.resolution import (
+from rasnik.cli.files import (
     TRACK_FILES,
     check_outputs,
     save_json,
     stored_track,
     system_for,
+    written,
 )
 
 if TYPE_CHECKING:
@@ -289,7 +289,7 @@ def _folded(
     name: str, system_name: str | None, overrides: list[str], periods: str | None
 ) -> tuple[Folding, dict[str, Any]]:
     track = _track(name)
-    system = load(system_name, overrides) if system_name else system_for(track, overrides)
+    system = load(system_name, overrides) if system_name else system_for(name, track, overrides)
     if system is None:
         fail(f"{name} does not say of what system it is; give --system.")
     lengths = None if periods is None else tuple(_lengths_um(periods, "--period"))

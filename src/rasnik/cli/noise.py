@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rasnik.cli.budget import PlotOption, written
 from rasnik.cli.common import fail, load, messages, output
+from rasnik.cli.files import PlotOption, written
 from rasnik.cli.predict import SetOption
 
 if TYPE_CHECKING:

@@ -5,30 +5,20 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from rasnik.cli.analyse import Method
-from rasnik.cli.budget import written
 from rasnik.cli.common import fail, load, messages, output
+from rasnik.cli.files import check_outputs, save_json, stored_track, system_for, written
 
 if TYPE_CHECKING:
     from rasnik.characterisation.resolution import Resolution
     from rasnik.instrument import System
     from rasnik.tracking.track import Track
 
-__all__ = [
-    "TRACK_FILES",
-    "check_outputs",
-    "resolution_command",
-    "save_json",
-    "stored_track",
-    "system_for",
-]
-
-#: Endings of names that may be those of a track.
-TRACK_FILES = (".h5", ".hdf5", ".csv", ".parquet")
+__all__ = ["resolution_command"]
 
 #: Shown unit and factor to it, of nm, rad and ratio.
 _SHOWN = {"nm": ("nm", 1.0), "rad": ("µrad", 1e6), "": ("1e-6", 1e6)}
@@ -88,7 +78,7 @@ def resolution_command(
         track = _track_of(source, system, method)
     elif method is not None:
         fail("--method is for images; a track is measured already.")
-    system = system or system_for(track, overrides or [])
+    system = system or system_for(source[0], track, overrides or [])
 
     from rasnik.characterisation.resolution import resolution
 
@@ -109,56 +99,6 @@ def resolution_command(
 
             draw = partial(plot_resolution, found, path, title=Path(source[0]).name)
             written(path, draw, quiet=as_json)
-
-
-# ------------------------------------------------------------------------ shared with linearity
-
-
-def check_outputs(paths: list[Path] | None, suffixes: tuple[str, ...]) -> list[Path]:
-    """The files to be written; a wrong name must not come out at the end of a long run."""
-    for path in paths or ():
-        if path.suffix.lower() not in suffixes:
-            fail(f"{path}: the name must end in {', '.join(suffixes)}.")
-        if not path.parent.is_dir():
-            fail(f"{path} cannot be written: there is no folder {path.parent}.")
-    return list(paths or ())
-
-
-def stored_track(name: str) -> Track | None:
-    """The track in a file; None if the file holds images."""
-    from rasnik.io import read_track
-
-    if not name.lower().endswith(TRACK_FILES):
-        return None
-    try:
-        return read_track(name)
-    except ValueError as error:
-        if name.lower().endswith((".h5", ".hdf5")):  # maybe images
-            return None
-        fail(f"{str(error).rstrip('.')}.")
-    except (OSError, ImportError) as error:
-        fail(f"{str(error).rstrip('.')}.")
-
-
-def system_for(track: Track, overrides: list[str]) -> System | None:
-    """The system that is stored with a track, if there is one."""
-    import tomllib
-
-    from rasnik.instrument import System, SystemConfigError, load_system
-
-    text = track.metadata.get("system_toml")
-    if not text:
-        return None
-    try:
-        return load_system(System.model_validate(tomllib.loads(text)), overrides)
-    except (SystemConfigError, ValueError) as error:
-        fail(f"the system stored with the track cannot be read: {error}")
-
-
-def save_json(path: Path, document: dict[str, Any], *, quiet: bool) -> None:
-    """Write a document, and say so."""
-    text = json.dumps(document, indent=2) + "\n"
-    written(path, lambda: cast(None, path.write_text(text, encoding="utf-8")), quiet=quiet)
 
 
 # ------------------------------------------------------------------------ frames

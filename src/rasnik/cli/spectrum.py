@@ -9,15 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rasnik.cli.budget import written
 from rasnik.cli.common import fail, load, messages, numbers, output
-from rasnik.cli.resolution import check_outputs
+from rasnik.cli.files import check_outputs, read_stored, system_for, written
 
 if TYPE_CHECKING:
     from rasnik.characterisation.spectrum import Coherence
     from rasnik.characterisation.track_spectrum import TrackSpectrum
-    from rasnik.instrument import System
-    from rasnik.tracking.track import Track
 
 __all__ = ["spectrum_command"]
 
@@ -109,9 +106,11 @@ def spectrum_command(
     found: list[TrackSpectrum] = []
     labels = _labels(tracks)
     for path, label in zip(tracks, labels, strict=True):
-        track = _read(path)
+        track = read_stored(path)
+        if not track.ok.any():
+            fail(f"{path}: no frame of the track has a position.")
         try:
-            limit = bound_of(track, system or _stored_system(path, track, overrides or []))
+            limit = bound_of(track, system or system_for(path, track, overrides or []))
         except ValueError as error:
             limit = None
             messages().print(f"{path}: no bound: {error}", markup=False)
@@ -185,34 +184,6 @@ def _labels(paths: list[Path]) -> list[str]:
         return [""]
     stems = [path.stem for path in paths]
     return stems if len(set(stems)) == len(stems) else [str(path) for path in paths]
-
-
-def _read(path: Path) -> Track:
-    from rasnik.io import read_track
-
-    try:
-        track = read_track(path)
-    except (ValueError, OSError, ImportError) as error:
-        fail(f"{str(error).rstrip('.')}.")
-    if not track.ok.any():
-        fail(f"{path}: no frame of the track has a position.")
-    return track
-
-
-def _stored_system(path: Path, track: Track, overrides: list[str]) -> System | None:
-    import tomllib
-
-    from rasnik.instrument import System, SystemConfigError, load_system
-
-    text = track.metadata.get("system_toml")
-    if not text:
-        if overrides:
-            fail(f"{path} holds no system that --set could change; give --system.")
-        return None
-    try:
-        return load_system(System.model_validate(tomllib.loads(text)), overrides)
-    except (SystemConfigError, ValueError) as error:
-        fail(f"{path}: the system stored with the track cannot be read: {error}")
 
 
 # ------------------------------------------------------------------------ further curves
