@@ -1,0 +1,181 @@
+"""The page's server: a thread beside the cameras."""
+
+from __future__ import annotations
+
+import ipaddress
+import os
+import socket
+import stat
+import threading
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from rasnik.live.station import Server
+
+if TYPE_CHECKING:
+    from rasnik.live.service import Station
+
+__all__ = ["PageError", "PageServer", "read_token"]
+
+#: Letters of a token, at least.
+SHORTEST_TOKEN = 16
+_PATIENCE_S = 10.0
+
+
+class PageError(Exception):
+    """The page cannot be served; the message is a sentence with its remedy."""
+
+
+def read_token(path: Path) -> str:
+    """The token in a file that nobody else may read.
+
+    Raises
+    ------
+    PageError
+        If there is none, it is short, or others can read it.
+    """
+    try:
+        with path.open(encoding="ascii") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            token = file.read(4096).strip()
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not plain text"
+        raise PageError(f"The token file {path} cannot be read: {reason}.") from None
+    if os.name == "posix" and mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise PageError(
+            f"Others can read the token file {path}; make it yours alone: chmod 600 {path}"
+        )
+    if len(token) < SHORTEST_TOKEN or len(token.split()) != 1:
+        raise PageError(
+            f"The token in {path} must be one word of {SHORTEST_TOKEN} letters or more; make one "
+            f"with: openssl rand -hex 24 > {path}"
+        )
+    return token
+
+
+class PageServer:
+    """Serves the page and the HTTP interface of a station.
+
+    Parameters
+    ----------
+    station : Station
+    config : Server
+        Where to listen. Port 0 takes any that is free.
+
+    Raises
+    ------
+    PageError
+        If the address is not that of this machine alone and there is no token.
+    """
+
+    def __init__(self, station: Station, config: Server) -> None:
+        self._station = station
+        self._config = config
+        self._token = read_token(config.token_file) if config.token_file is not None else None
+        if self._token is None and not is_loopback(config.host):
+            raise PageError(
+                f"The page would be open to everybody at {config.host}: give a token_file in "
+                "[server] of the station file, or listen on 127.0.0.1."
+            )
+        self._server: Any = None
+        self._thread: threading.Thread | None = None
+        self._port = config.port
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        host = self._config.host
+        if host in ("0.0.0.0", "::"):
+            host = socket.gethostname()
+        return f"http://[{host}]:{self._port}/" if ":" in host else f"http://{host}:{self._port}/"
+
+    def start(self) -> None:
+        """Listen; returns when requests are answered.
+
+        Raises
+        ------
+        PageError
+            If the port is taken, or a package is missing.
+        """
+        try:
+            import uvicorn
+
+            from rasnik.web.app import create_app
+        except ImportError as error:
+            raise PageError(
+                f"The page needs {error.name}; install it with: pip install 'rasnik[live]'"
+            ) from None
+        listener = self._listener()
+        self._port = listener.getsockname()[1]
+        self._server = uvicorn.Server(
+            uvicorn.Config(
+                create_app(self._station, token=self._token),
+                ws="websockets-sansio",
+                http="h11",
+                loop="asyncio",
+                lifespan="off",
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                proxy_headers=False,
+                ws_max_size=16 * 1024,
+                ws_per_message_deflate=False,  # pictures are compressed already
+                limit_concurrency=200,
+                timeout_keep_alive=15,
+                timeout_graceful_shutdown=2,
+            )
+        )
+        self._thread = threading.Thread(
+            target=self._server.run, args=([listener],), name="page", daemon=True
+        )
+        self._thread.start()
+        end = time.monotonic() + _PATIENCE_S
+        while not self._server.started:
+            if not self._thread.is_alive() or time.monotonic() > end:
+                raise PageError("The page's server did not start; the log says why.")
+            time.sleep(0.005)
+
+    def stop(self) -> None:
+        """Close all connections; harmless if it does not run."""
+        if self._server is None or self._thread is None:
+            return
+        self._server.should_exit = True
+        self._thread.join(_PATIENCE_S)
+        self._server = self._thread = None
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.stop()
+
+    def _listener(self) -> socket.socket:
+        host, port = self._config.host, self._config.port
+        try:
+            family, _, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+            listener = socket.socket(family, socket.SOCK_STREAM)
+        except OSError as error:
+            raise PageError(f"There is no address {host}: {error.strerror or error}.") from None
+        try:
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            listener.bind(address)
+            listener.listen(128)
+        except OSError as error:
+            listener.close()
+            raise PageError(
+                f"The page cannot listen on {host}, port {port}: {error.strerror or error}. "
+                "Choose another with --port; 0 takes any that is free."
+            ) from None
+        return listener
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is seen by this machine alone."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
