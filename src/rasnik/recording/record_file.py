@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import time
 from collections.abc import Mapping
 from datetime import UTC, datetime
@@ -16,33 +15,16 @@ from numpy.typing import NDArray
 from rasnik.instrument import System
 from rasnik.io.track_file import TrackWriter
 from rasnik.io.track_table import from_rows
+from rasnik.recording.disk import DiskError, free_mib, new_name
 from rasnik.recording.options import Recording
 from rasnik.recording.rows import RECORD_COLUMNS
+from rasnik.recording.summary import Summary, save_summary
 
-__all__ = ["DiskError", "RecordFiles", "free_mib", "name_time", "new_name", "record_files"]
+__all__ = ["RecordFiles", "name_time", "record_files"]
 
 _MIB = 1 << 20
 _SPARE_MIB = 1.0  # for what a file needs beside its rows
 _PATIENCE_S = 30.0  # longest time between attempts with a disk that fails
-
-
-class DiskError(Exception):
-    """Rows cannot be stored now; the message is a sentence with its remedy."""
-
-
-def free_mib(folder: Path) -> float:
-    """Space that is left on the disk of a folder."""
-    return shutil.disk_usage(folder).free / _MIB
-
-
-def new_name(folder: Path, channel: str, time_s: float, suffix: str) -> Path:
-    """CHANNEL_YYYYmmddTHHMMSSZ and the suffix, with a number if the name is taken."""
-    stem = f"{channel}_{datetime.fromtimestamp(time_s, UTC):%Y%m%dT%H%M%SZ}"
-    path, number = folder / f"{stem}{suffix}", 1
-    while path.exists():
-        number += 1
-        path = folder / f"{stem}_{number}{suffix}"
-    return path
 
 
 def name_time(path: Path) -> tuple[str, int]:
@@ -82,6 +64,7 @@ class RecordFiles:
         self.folder, self.channel = folder, channel
         self._system, self._options, self._metadata = system, options, metadata
         self._writer: TrackWriter | None = None
+        self._summary = Summary()
         self._began_s = 0.0
         self._failures = 0
         self._again_s = 0.0
@@ -92,8 +75,13 @@ class RecordFiles:
     def is_closed(self) -> bool:
         return self._writer is None
 
-    def write(self, rows: NDArray[Any]) -> int:
-        """Store rows; the number of the first of them in the file.
+    def current(self) -> tuple[Path, NDArray[Any]] | None:
+        """The file that is being written, and the bins of its summary; from any thread."""
+        writer, summary = self._writer, self._summary
+        return None if writer is None else (writer.path, summary.bins())
+
+    def write(self, rows: NDArray[Any]) -> None:
+        """Store rows.
 
         Raises
         ------
@@ -110,8 +98,8 @@ class RecordFiles:
             writer.write(from_rows(rows), columns)
         except (OSError, RuntimeError) as error:
             self._fail(error)
+        self._summary.extend(rows, first)
         self._failures = 0
-        return first
 
     def sync(self) -> None:
         """Ask the disk to have what was written."""
@@ -130,7 +118,10 @@ class RecordFiles:
             writer.close()
         except (OSError, RuntimeError):
             pass  # its rows were stored, or are kept and go to the next file
-        if writer.rows == 0:
+        bins, self._summary = self._summary.bins(), Summary()
+        if len(bins) or writer.rows:
+            save_summary(writer.path, bins)
+        else:
             writer.path.unlink(missing_ok=True)
 
     def _check_space(self, size: int) -> None:

@@ -9,12 +9,15 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-import numpy as np
 from numpy.typing import NDArray
 
 from rasnik.instrument import System
+from rasnik.recording.disk import DiskError
+from rasnik.recording.events import FrameKeeper
+from rasnik.recording.frame_file import FrameWriter
+from rasnik.recording.history import History
 from rasnik.recording.options import Recording
-from rasnik.recording.record_file import DiskError, RecordFiles
+from rasnik.recording.record_file import RecordFiles
 from rasnik.recording.rows import RowQueue, row_of
 from rasnik.recording.sample import Sample
 
@@ -43,6 +46,8 @@ class RecorderStatus:
         Rows given up because the disk failed for longer than memory lasts.
     kept_frames : int
         Raw frames stored.
+    dropped_frames : int
+        Raw frames of events that could not be stored.
     """
 
     recording: bool = False
@@ -51,6 +56,7 @@ class RecorderStatus:
     message: str = ""
     not_recorded: int = 0
     kept_frames: int = 0
+    dropped_frames: int = 0
 
 
 class Recorder:
@@ -82,11 +88,17 @@ class Recorder:
         self._options = options
         self._queue = RowQueue(_MOST_ROWS)
         self._files = RecordFiles(self.folder, channel, system, options, metadata)
+        self._history = History(self.folder, self._files.current)
+        self._frames = FrameWriter(
+            self.folder / "frames", channel, system, metadata, options.keep_free_mib
+        )
+        self._keeper = FrameKeeper(options.raw, self._frames.write, self._frames.end)
         self._recording = False
         self._closed = False
         self._rows = 0
         self._not_recorded = 0
         self._trouble = ""
+        self._fault = ""
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._keep_storing, name=f"record {channel}")
         self._thread.daemon = True
@@ -96,8 +108,13 @@ class Recorder:
 
     def add(self, sample: Sample) -> None:
         """Take a sample; quick, and never an exception."""
-        if self._recording and not self._queue.add(row_of(sample)):
-            self._not_recorded += 1
+        recording = self._recording
+        try:
+            if recording and not self._queue.add(row_of(sample)):
+                self._not_recorded += 1
+            self._keeper.add(sample, automatic=recording)
+        except Exception as error:  # measuring goes on whatever it is
+            self._fault = f"a sample was refused ({type(error).__name__}: {error})"
 
     def start(self) -> None:
         """Record from now on, in a new file; harmless if it is recording."""
@@ -122,6 +139,8 @@ class Recorder:
         self._thread.join(_STOP_S)
         self._not_recorded += len(self._queue)
         self._queue.forget(len(self._queue))
+        self._keeper.finish()
+        self._frames.close(_STOP_S)
 
     def __enter__(self) -> Self:
         return self
@@ -136,24 +155,63 @@ class Recorder:
 
     def status(self) -> RecorderStatus:
         """What it is doing."""
-        lost = self._not_recorded
-        messages = [self._trouble] if self._trouble else []
+        lost, frames = self._not_recorded, self._frames
+        messages = [self._fault, self._trouble, frames.trouble]
         if lost:
-            messages.append(f"{lost} rows were not recorded")
+            messages.append(f"{lost} rows were not recorded: memory was full of rows that wait")
+        if frames.dropped:
+            messages.append(f"{frames.dropped} raw frames were dropped")
+        if self._keeper.refused:
+            messages.append(
+                f"frames of {self._keeper.refused} events were not kept, as there were more than "
+                f"{self._options.raw.most_per_hour} in an hour"
+            )
         return RecorderStatus(
             recording=self._recording,
             rows=self._rows,
             file=str(self._files.path or ""),
-            message="; ".join(messages),
+            message="; ".join(message for message in messages if message),
             not_recorded=lost,
+            kept_frames=frames.kept,
+            dropped_frames=frames.dropped,
         )
 
     def event(self, reason: str) -> None:
-        """Keep the frames around this moment."""
+        """Keep the frames around this moment.
+
+        Parameters
+        ----------
+        reason : str
+            Stored with them. Reasons that begin with "alarm", "glitch" or "lock_lost" (up to a
+            colon, if there is one) count only if the options name them, and are limited in
+            number; others are taken as asked for.
+        """
+        self._keeper.event(reason)
 
     def history(self, start_s: float, end_s: float, points: int) -> dict[str, NDArray[Any]]:
-        """Least, mean and largest value in bins of time, read back from the record."""
-        return {"time_s": np.empty(0)}
+        """Least, mean and largest values in bins of time, read back from the record.
+
+        Parameters
+        ----------
+        start_s, end_s : float
+            Seconds since 1970 UTC.
+        points : int
+            Number of bins.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (points,)
+            ``time_s``: the middle of each bin; ``count``: rows with a position; ``x_um_min``,
+            ``x_um_mean``, ``x_um_max``, and the same of ``y_um``, ``scale`` and ``theta_rad``:
+            NaN where there is none. Bins of a second and more are made of half seconds, each of
+            which belongs as a whole to one bin.
+
+        Raises
+        ------
+        ValueError
+            If the end is not after the start, or the number of points is not sensible.
+        """
+        return self._history.read(start_s, end_s, points)
 
     # ------------------------------------------------------------------ in the thread
 
@@ -167,6 +225,7 @@ class Recorder:
                 if not self._closed:
                     self._changed.wait(wait_s)
                 closed = self._closed
+            self._keeper.tick()
             stored = self._store()
             with self._changed:
                 if not self._recording and stored:

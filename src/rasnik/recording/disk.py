@@ -1,0 +1,28 @@
+"""Space on a disk, and names that are not taken."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+__all__ = ["DiskError", "free_mib", "new_name"]
+
+
+class DiskError(Exception):
+    """Something cannot be stored now; the message is a sentence with its remedy."""
+
+
+def free_mib(folder: Path) -> float:
+    """Space that is left on the disk of a folder."""
+    return shutil.disk_usage(folder).free / (1 << 20)
+
+
+def new_name(folder: Path, channel: str, time_s: float, suffix: str) -> Path:
+    """CHANNEL_YYYYmmddTHHMMSSZ and the suffix, with a number if the name is taken."""
+    stem = f"{channel}_{datetime.fromtimestamp(time_s, UTC):%Y%m%dT%H%M%SZ}"
+    path, number = folder / f"{stem}{suffix}", 1
+    while path.exists():
+        number += 1
+        path = folder / f"{stem}_{number}{suffix}"
+    return path
