@@ -34,6 +34,7 @@ _NM_PER_UM = 1e3
 _MRAD_PER_RAD = 1e3
 _PPM = 1e6
 _PERCENT = 100.0
+_NOT_A_CLOCK_S = 1e9  # the year 2001; clocks that count from 0 stay below
 
 
 class Severity(IntEnum):
@@ -111,8 +112,14 @@ def _times(limits: Limits | None, factor: float) -> Limits | None:
 
 
 _POSE = (
-    Value("x_um", "X", "float", "um", "mask x at the sensor's centre", 6, True, judged_by="x_rel_nm"),
-    Value("y_um", "Y", "float", "um", "mask y at the sensor's centre", 6, True, judged_by="y_rel_nm"),
+    Value(
+        "x_um", "X", "float", "um", "mask x at the sensor's centre", 6, True,
+        judged_by="x_rel_nm",
+    ),
+    Value(
+        "y_um", "Y", "float", "um", "mask y at the sensor's centre", 6, True,
+        judged_by="y_rel_nm",
+    ),
     Value("scale", "SCALE", "float", "", "image size / mask size", 9, True, lambda a: a.scale),
     Value(
         "theta_rad", "THETA", "float", "rad", "rotation, anticlockwise on the image", 9, True,
@@ -255,5 +262,9 @@ def judge(value: Value, status: ChannelStatus, alarms: Alarms) -> Severity:
 
 
 def frame_time_s(status: ChannelStatus) -> float:
-    """Time of the frame that a status tells of, in seconds since 1970 UTC; now if there is none."""
-    return status.time_s if math.isfinite(status.time_s) else time.time()
+    """Time of the frame that a status tells of, in seconds since 1970 UTC.
+
+    Recordings may count from their beginning, and a channel may have had no frame yet. Then it
+    is the time of the call.
+    """
+    return status.time_s if status.time_s > _NOT_A_CLOCK_S else time.time()
