@@ -110,7 +110,10 @@ class _FrameFile:
         if sample.frame.image.shape != self._shape or sample.number <= self._number:
             return False
         # What the row refers to is on its way before the row.
-        append_rows(self._frames, sample.frame.image[None])
+        count = len(self._frames)
+        self._frames.resize(count + 1, axis=0)
+        self._frames[count] = sample.frame.image
+        self._frames.flush()
         append_rows(self._poses, np.array([row_of(sample)], dtype=RECORD_ROW))
         self._number = sample.number
         return True

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
 from numpy.typing import NDArray
 
 from rasnik.instrument import System
@@ -238,7 +239,7 @@ class Recorder:
     def _store(self) -> bool:
         """Write what waits; whether nothing does any more."""
         try:
-            while len(rows := self._queue.take(_PIECE_ROWS)):
+            while len(rows := _increasing(self._queue.take(_PIECE_ROWS))):
                 self._files.write(rows)
                 self._queue.forget(len(rows))
                 self._rows += len(rows)
@@ -252,3 +253,9 @@ class Recorder:
             self._files.close()
             return False
         return True
+
+
+def _increasing(rows: NDArray[Any]) -> NDArray[Any]:
+    """The first rows, up to where a number is not above the one before."""
+    falls = np.flatnonzero(np.diff(rows["frame"]) <= 0)
+    return rows[: falls[0] + 1] if len(falls) else rows
