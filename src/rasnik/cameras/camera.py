@@ -121,7 +121,7 @@ class Camera(ABC):
 
     name: str = ""
     metrology: ClassVar[bool] = True
-    number_wraps_at: ClassVar[int | None] = None
+    number_wraps_at: int | None = None
     live: bool = True
 
     @abstractmethod
