@@ -1,0 +1,93 @@
+"""The last minutes of a channel, in memory."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rasnik.recording.sample import Sample
+from rasnik.tracking.track import POSE_COLUMNS, TRACK_COLUMNS
+
+__all__ = ["RECENT_ROW", "Recent"]
+
+#: The columns of a track, and what is only known where the frames come in.
+RECENT_ROW = np.dtype(
+    [(column.name, column.dtype) for column in TRACK_COLUMNS]
+    + [(name, "f8") for name in ("host_time_s", "device_time_s", "latency_s", "exposure_us")]
+)
+_ROWS = 1 << 16
+
+
+class Recent:
+    """A ring of rows; written by one thread, read by any.
+
+    Rows are counted from 0 since the channel began; the oldest are overwritten.
+
+    Parameters
+    ----------
+    rows : int
+        How many are kept.
+    """
+
+    def __init__(self, rows: int = _ROWS) -> None:
+        self._rows = np.zeros(rows, dtype=RECENT_ROW)
+        self._count = 0
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return min(self._count, len(self._rows))
+
+    @property
+    def count(self) -> int:
+        """Rows since the channel began; the index that the next one will have."""
+        return self._count
+
+    def add(self, sample: Sample, time_s: float, latency_s: float) -> None:
+        """Append the row of a sample."""
+        frame, pose = sample.frame, sample.pose
+        row = (
+            sample.number,
+            time_s,
+            *(getattr(pose, name) for name in POSE_COLUMNS),
+            int(pose.flags),
+            frame.host_time_s,
+            frame.device_time_s,
+            latency_s,
+            frame.exposure_us,
+        )
+        with self._lock:
+            self._rows[self._count % len(self._rows)] = row
+            self._count += 1
+
+    def since(self, index: int) -> tuple[NDArray[Any], int]:
+        """Rows from an index on, as far as they are kept, and the index to continue from.
+
+        Parameters
+        ----------
+        index : int
+            0 for all; what the last call returned for those that are new.
+        """
+        with self._lock:
+            first = min(max(index, self._count - len(self._rows), 0), self._count)
+            size = len(self._rows)
+            start, stop = first % size, self._count % size
+            if first == self._count:
+                return self._rows[:0].copy(), self._count
+            if start < stop:
+                return self._rows[start:stop].copy(), self._count
+            return np.concatenate([self._rows[start:], self._rows[:stop]]), self._count
+
+    def last(self, seconds: float) -> NDArray[Any]:
+        """Rows of the last seconds before the newest, by the host's clock."""
+        size = 1024
+        while True:  # the ring is large: no more of it is copied than is needed
+            rows, _ = self.since(max(self._count - size, 0))
+            if not len(rows):
+                return rows
+            begin_s = rows["host_time_s"][-1] - seconds
+            if rows["host_time_s"][0] < begin_s or len(rows) < size:
+                return rows[rows["host_time_s"] >= begin_s]
+            size *= 4
