@@ -10,6 +10,7 @@ from rasnik.cli.analyse import analyse_command
 from rasnik.cli.budget import budget_command
 from rasnik.cli.demo import demo_command
 from rasnik.cli.design import design_command
+from rasnik.cli.doctor import doctor_command
 from rasnik.cli.edges import edges_command
 from rasnik.cli.export import export_command
 from rasnik.cli.linearity import linearity_command
@@ -70,3 +71,4 @@ app.command("resolution")(resolution_command)
 app.command("linearity")(linearity_command)
 app.command("paper")(paper_command)
 app.command("spectrum")(spectrum_command)
+app.command("doctor")(doctor_command)
