@@ -172,16 +172,12 @@ def _image(station: Station, channel: Channel, values: dict[str, Any]) -> Any:
 def _metrics(station: Station, _: None, values: dict[str, Any]) -> Any:
     if not station.config.controls.prometheus.enabled:
         raise ApiError(404, "Metrics are switched off in the station file.")
-    try:
-        from rasnik.controls.prometheus import render
+    from rasnik.controls.prometheus import CONTENT_TYPE, render
 
-        text = render(station)
+    try:
+        return Bytes(render(station).encode(), CONTENT_TYPE)
     except ImportError as error:
-        raise ApiError(
-            503,
-            f"Metrics need {error.name}; install it with: pip install 'rasnik[prometheus]'",
-        ) from None
-    return Bytes(text.encode(), "text/plain; version=0.0.4; charset=utf-8")
+        raise ApiError(503, str(error)) from None
 
 
 # ------------------------------------------------------------------------ what is done

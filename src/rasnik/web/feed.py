@@ -22,6 +22,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from rasnik.web.packets import pack
 from rasnik.web.picture import Pictures
 from rasnik.web.quantities import QUANTITIES, finite, status_dict
+from rasnik.web.rows import last_rows
 from rasnik.web.spectra import Spectra
 
 if TYPE_CHECKING:
@@ -195,9 +196,10 @@ class _Client:
 
     async def _rows(self, channel: Channel, wishes: _Wishes, after: int) -> int:
         first = after < 0
-        rows, following = channel.recent.since(max(after, 0))
-        if first and len(rows):
-            rows = rows[rows["host_time_s"] >= rows["host_time_s"][-1] - wishes.rows_s]
+        if first:
+            rows, following = last_rows(channel.recent, wishes.rows_s)
+        else:
+            rows, following = channel.recent.since(after)
         rows = rows[-_MOST_ROWS:]
         if not len(rows) and not first:
             return following

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rasnik.characterisation.gaps import Series
 from rasnik.characterisation.spectrum import welch
 from rasnik.web.quantities import QUANTITIES, Quantity
+from rasnik.web.rows import last_rows
 
 __all__ = ["Spectra", "live_spectrum"]
 
@@ -95,6 +96,6 @@ class Spectra:
             if made is None or time.monotonic() - made[0] > _FRESH_S:
                 if len(self._made) > 8:
                     self._made.clear()
-                rows = self._recent.last(seconds)[-_MOST_ROWS:]
+                rows, _ = last_rows(self._recent, seconds)
                 made = self._made[seconds] = (time.monotonic(), *live_spectrum(rows))
             return made[1:]

@@ -38,7 +38,7 @@ export class Overview {
       card.state.textContent = word;
       card.state.className = `state ${colour}`;
       const { x_nm, y_nm } = channel.relative;
-      card.numbers.textContent = `x ${grouped(x_nm)}  y ${grouped(y_nm)} nm  ${short(channel.frame_rate_hz)} Hz${channel.recording ? "  ● rec" : ""}`;
+      card.numbers.textContent = `x ${grouped(x_nm)}, y ${grouped(y_nm)} nm, ${short(channel.frame_rate_hz)} Hz${channel.recording ? ", ● rec" : ""}`;
     }
   }
 

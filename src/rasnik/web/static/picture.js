@@ -2,7 +2,7 @@
 
 import { clock, grouped } from "./numbers.js";
 
-const LATTICE = "rgba(80, 230, 120, 0.55)";
+const LATTICE = "rgba(80, 230, 120, 0.4)";
 const CODE = "#ff9d2e";
 
 function sized(canvas, ratio) {

@@ -46,7 +46,7 @@ export class Spectrum {
       padding: [8, 12, 0, 0],
       legend: { show: false },
       cursor: { drag: { x: false, y: false }, points: { show: false } },
-      scales: { x: { time: false, distr: 3 }, y: { distr: 3 } },
+      scales: { x: { time: false, distr: 3, range: (u, low, high) => (high > low && low > 0 ? [low, high] : [0.1, 100]) }, y: { distr: 3 } },
       series: [{}, ...colours.map(line), ...colours.map((c) => ({ ...line(c), dash: [6, 5], width: 1.5 }))],
       axes: [
         { ...axis(powers, 44), label: "frequency / Hz", labelSize: 18, labelFont: "12px system-ui" },
