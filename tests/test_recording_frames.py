@@ -319,7 +319,7 @@ def test_a_part_that_another_program_writes_is_left_alone(tmp_path):
 
 
 def test_a_recorder_keeps_them(tmp_path):
-    options = Recording(flush_s=0.1, keep_free_mib=0, raw=RawFrames(before_s=0.5, after_s=0.1))
+    options = Recording(flush_s=0.1, keep_free_mib=0, raw=RawFrames(before_s=0.505, after_s=0.105))
     with Recorder(tmp_path, "hall", SYSTEM, options, {}) as record:
         record.start()
         now_s = time.perf_counter()
@@ -332,4 +332,4 @@ def test_a_recorder_keeps_them(tmp_path):
         path.stem.rpartition("_")[2]: [int(frame.image[0, 0]) for frame in iter_frames([path])]
         for path in (tmp_path / "hall" / "frames").iterdir()
     }
-    assert numbers == {"lost": list(range(30, 91)), "asked-for": list(range(91, 100))}
+    assert numbers == {"lock-lost": list(range(30, 91)), "asked-for": list(range(91, 100))}

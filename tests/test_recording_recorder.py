@@ -193,8 +193,8 @@ def test_a_full_disk_is_said_and_waited_for(tmp_path, monkeypatch):
             record.add(sample_of(number))
         wait_for(lambda: record.status().message)
         status = record.status()
-        assert "the disk is full: 49.0 MiB are free" in status.message
-        assert "make space" in status.message
+        assert "The disk is full: 49.0 MiB are free" in status.message
+        assert "Make space" in status.message
         assert (status.rows, status.not_recorded) == (1, 0)
         free[0] = 60.0
         wait_for(lambda: record.status().rows == 500)
@@ -249,7 +249,7 @@ def test_a_file_that_breaks_is_followed_by_another(tmp_path, monkeypatch):
         record.add(sample_of(1))
         wait_for(lambda: record.status().message)
         assert "input/output error" in record.status().message
-        assert "the next attempt follows by itself" in record.status().message
+        assert "The next attempt follows by itself" in record.status().message
         record.add(sample_of(2))
         broken[0] = False
         wait_for(lambda: record.status().rows == 3)
@@ -293,7 +293,7 @@ def test_a_sample_that_makes_no_sense_stops_nothing(tmp_path):
         record.start()
         record.add(None)
         record.add(sample_of(1))
-        assert "a sample was refused" in record.status().message
+        assert "A sample was refused" in record.status().message
     np.testing.assert_array_equal(rows_in(tmp_path)["frame"], [1])
 
 

@@ -227,7 +227,7 @@ class FrameWriter:
         size_mib = sample.frame.image.nbytes / _MIB
         self._folder.mkdir(parents=True, exist_ok=True)
         if free_mib(self._folder) < max(self._keep_free_mib, 1.0) + size_mib:
-            self.trouble = "frames are not kept: the disk is full; make space"
+            self.trouble = "Raw frames are not kept: the disk is full. Make space."
             return False
         if event not in self._open:
             self._open[event] = _FrameFile(
@@ -237,7 +237,7 @@ class FrameWriter:
         return self._open[event].write(sample)
 
     def _give_up(self, event: Event, error: Exception) -> None:
-        self.trouble = f"frames cannot be kept ({error}); the next event is tried again"
+        self.trouble = f"Raw frames could not be kept ({error}). The next event is tried again."
         self._broken.add(event)
         file = self._open.pop(event, None)
         if file is not None:

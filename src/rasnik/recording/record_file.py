@@ -129,8 +129,8 @@ class RecordFiles:
         free, least = free_mib(self.folder), self._options.keep_free_mib
         if free < max(least, _SPARE_MIB + size / _MIB):
             raise DiskError(
-                f"the disk is full: {free:.1f} MiB are free at {self.folder}, and recording keeps "
-                f"{least:g} MiB free; make space, and it goes on by itself"
+                f"The disk is full: {free:.1f} MiB are free at {self.folder}, and recording keeps "
+                f"{least:g} MiB free. Make space; it goes on by itself."
             )
 
     def _ready(self, rows: NDArray[Any]) -> TrackWriter:
@@ -163,5 +163,5 @@ class RecordFiles:
         self.close()
         self._failures += 1
         self._again_s = time.monotonic() + min(2.0 ** (self._failures - 1), _PATIENCE_S)
-        self._trouble = f"rows cannot be stored ({error}); the next attempt follows by itself"
+        self._trouble = f"Rows cannot be stored ({error}). The next attempt follows by itself."
         raise DiskError(self._trouble) from error

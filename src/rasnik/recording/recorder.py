@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ from rasnik.recording.rows import RowQueue, row_of
 from rasnik.recording.sample import Sample
 
 __all__ = ["Recorder", "RecorderStatus"]
+
+_log = logging.getLogger(__name__)
 
 #: Rows that wait for the disk: 18 minutes at 275 frames/s, 5 minutes at 900, in 50 MB.
 _MOST_ROWS = 300_000
@@ -115,7 +118,7 @@ class Recorder:
                 self._not_recorded += 1
             self._keeper.add(sample, automatic=recording)
         except Exception as error:  # measuring goes on whatever it is
-            self._fault = f"a sample was refused ({type(error).__name__}: {error})"
+            self._fault = f"A sample was refused ({type(error).__name__}: {error})."
 
     def start(self) -> None:
         """Record from now on, in a new file; harmless if it is recording."""
@@ -125,11 +128,14 @@ class Recorder:
             self._recording = True
 
     def stop(self) -> None:
-        """Record no more; what was taken before is stored, and the file is closed."""
+        """Record no more; what was taken before is stored, and the file is closed.
+
+        If the disk is in trouble that is left for later.
+        """
         with self._changed:
             self._recording = False
             self._changed.notify_all()
-            self._changed.wait_for(self._is_idle, _STOP_S)
+            self._changed.wait_for(lambda: self._is_idle() or bool(self._trouble), _STOP_S)
 
     def close(self) -> None:
         """Stop, and end the thread; what cannot be stored by then is given up and counted."""
@@ -138,8 +144,11 @@ class Recorder:
             self._closed = True
             self._changed.notify_all()
         self._thread.join(_STOP_S)
-        self._not_recorded += len(self._queue)
-        self._queue.forget(len(self._queue))
+        left = len(self._queue)
+        if left:
+            self._not_recorded += left
+            self._queue.forget(left)
+            _log.error("%s: %d rows could not be recorded. %s", self.folder, left, self._trouble)
         self._keeper.finish()
         self._frames.close(_STOP_S)
 
@@ -159,19 +168,19 @@ class Recorder:
         lost, frames = self._not_recorded, self._frames
         messages = [self._fault, self._trouble, frames.trouble]
         if lost:
-            messages.append(f"{lost} rows were not recorded: memory was full of rows that wait")
+            messages.append(f"{lost} rows were not recorded: too many waited for the disk.")
         if frames.dropped:
-            messages.append(f"{frames.dropped} raw frames were dropped")
+            messages.append(f"{frames.dropped} raw frames were dropped.")
         if self._keeper.refused:
             messages.append(
-                f"frames of {self._keeper.refused} events were not kept, as there were more than "
-                f"{self._options.raw.most_per_hour} in an hour"
+                f"Frames of {self._keeper.refused} events were not kept: there were more than "
+                f"{self._options.raw.most_per_hour} in an hour."
             )
         return RecorderStatus(
             recording=self._recording,
             rows=self._rows,
             file=str(self._files.path or ""),
-            message="; ".join(message for message in messages if message),
+            message=" ".join(message for message in messages if message),
             not_recorded=lost,
             kept_frames=frames.kept,
             dropped_frames=frames.dropped,
@@ -249,7 +258,7 @@ class Recorder:
             self._trouble = str(error)
             return False
         except Exception as error:  # whatever it is, measuring and the next attempt go on
-            self._trouble = f"rows cannot be stored ({type(error).__name__}: {error})"
+            self._trouble = f"Rows cannot be stored ({type(error).__name__}: {error})."
             self._files.close()
             return False
         return True
