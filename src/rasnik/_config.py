@@ -175,7 +175,7 @@ def toml_lines(part: BaseModel) -> list[str]:
     lines = []
     for name, info in type(part).model_fields.items():
         value = getattr(part, name)
-        if isinstance(value, BaseModel):
+        if isinstance(value, BaseModel) or _are_tables(value):
             continue
         comment = f"  # {info.description}" if info.description else ""
         if value is None:
@@ -185,7 +185,17 @@ def toml_lines(part: BaseModel) -> list[str]:
     return lines
 
 
-def _toml_value(value: str | int | float) -> str:
+def _are_tables(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], BaseModel)
+
+
+def _toml_value(value: str | int | float | Path | list[Any] | tuple[Any, ...]) -> str:
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml_value, value))}]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Path):
+        value = str(value)
     if not isinstance(value, str):
         return repr(value)
     escaped = value.replace("\\", "\\\\").replace('"', '\\"')

@@ -34,7 +34,9 @@ class _Part(BaseModel):
 class CameraConfig(_Part):
     """Where the frames of a channel come from, and the camera's settings."""
 
-    kind: Literal["simulated", "replay", "aravis", "opencv"] = "simulated"
+    kind: Literal["simulated", "replay", "aravis", "opencv"] = Field(
+        default="simulated", description="simulated, replay, aravis or opencv"
+    )
     device: str = Field(
         default="", description="aravis: serial number, name or address; opencv: number or path"
     )
@@ -44,15 +46,21 @@ class CameraConfig(_Part):
     motion_um: float = Field(default=2.0, ge=0, description="simulated: amplitude of the motion")
     motion_hz: float = Field(default=0.3, gt=0, description="simulated: its frequency")
     seed: int = Field(default=0, ge=0, description="simulated")
-    frame_rate_hz: float | None = Field(default=None, gt=0)
-    exposure_us: float | None = Field(default=None, gt=0)
-    gain_db: float | None = None
-    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] | None = None
+    frame_rate_hz: float | None = Field(
+        default=None, gt=0, description="Hz; these settings are left as they are if not set"
+    )
+    exposure_us: float | None = Field(default=None, gt=0, description="us")
+    gain_db: float | None = Field(default=None, description="dB")
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] | None = Field(
+        default=None, description="Mono8, Mono10, Mono12 or Mono16"
+    )
     region: tuple[int, int, int, int] | None = Field(
         default=None, description="left, top, width, height"
     )
     trigger: str | None = Field(default=None, description='"free" or the name of an input')
-    packet_bytes: int | None = Field(default=None, ge=576, le=16384)
+    packet_bytes: int | None = Field(
+        default=None, ge=576, le=16384, description="size of network packets"
+    )
     keep_exposure: bool = Field(
         default=False, description="keep the brightest fields just below full scale"
     )
@@ -74,23 +82,29 @@ class CameraConfig(_Part):
 class Alarms(_Part):
     """Limits; beyond them a channel is in alarm. Positions count from its zero."""
 
-    x_um: tuple[float, float] | None = None
-    y_um: tuple[float, float] | None = None
-    scale: tuple[float, float] | None = None
-    theta_mrad: tuple[float, float] | None = None
-    chi2_ndf: tuple[float, float] | None = None
-    frame_rate_hz: tuple[float, float] | None = None
-    lost_percent: float | None = Field(default=1.0, ge=0, description="of the last 10 s")
-    unlocked_s: float | None = Field(default=1.0, ge=0, description="without a position")
+    x_um: tuple[float, float] | None = Field(default=None, description="[low, high] in um")
+    y_um: tuple[float, float] | None = Field(default=None, description="[low, high] in um")
+    scale: tuple[float, float] | None = Field(default=None, description="[low, high]")
+    theta_mrad: tuple[float, float] | None = Field(default=None, description="[low, high] in mrad")
+    chi2_ndf: tuple[float, float] | None = Field(default=None, description="[low, high]")
+    frame_rate_hz: tuple[float, float] | None = Field(default=None, description="[low, high] in Hz")
+    lost_percent: float | None = Field(
+        default=1.0, ge=0, description="of the frames of the last 10 s"
+    )
+    unlocked_s: float | None = Field(default=1.0, ge=0, description="s without a position")
 
 
 class ChannelConfig(_Part):
     """One Rasnik: a system, a camera, and what is done with its poses."""
 
-    name: _Name
+    name: _Name = Field(description="letters, digits, - and _")
     system: str = Field(default="solidras", description="name or TOML file of the system")
-    orientation: int | None = Field(default=None, ge=1, le=4)
-    model: Literal["auto", "similarity", "affine", "projective"] = "auto"
+    orientation: int | None = Field(
+        default=None, ge=1, le=4, description="1 to 4; found from the first frames if not set"
+    )
+    model: Literal["auto", "similarity", "affine", "projective"] = Field(
+        default="auto", description="map from mask to image: similarity, affine, projective"
+    )
     camera: CameraConfig = CameraConfig()
     recording: Recording = Recording()
     alarms: Alarms = Alarms()
@@ -100,7 +114,7 @@ class Server(_Part):
     """Who may look."""
 
     host: str = Field(default="127.0.0.1", description="address to listen on")
-    port: int = Field(default=8080, ge=0, le=65535)
+    port: int = Field(default=8080, ge=0, le=65535, description="0 takes one that is free")
     token_file: Path | None = Field(default=None, description="needed for any other address")
 
 
@@ -108,20 +122,22 @@ class Epics(_Part):
     """Process variables, by Channel Access and PV Access."""
 
     enabled: bool = False
-    prefix: str = Field(default="RASNIK", pattern=r"^[A-Za-z0-9_:-]{1,40}$")
-    rate_hz: float = Field(default=10.0, gt=0, le=100)
+    prefix: str = Field(
+        default="RASNIK", pattern=r"^[A-Za-z0-9_:-]{1,40}$", description="of all names"
+    )
+    rate_hz: float = Field(default=10.0, gt=0, le=100, description="updates in a second")
 
 
 class Mqtt(_Part):
     """Messages to a broker."""
 
     enabled: bool = False
-    host: str = "localhost"
+    host: str = Field(default="localhost", description="of the broker")
     port: int = Field(default=1883, ge=1, le=65535)
-    topic: str = Field(default="rasnik", min_length=1)
+    topic: str = Field(default="rasnik", min_length=1, description="all topics begin with it")
     username: str | None = None
-    password_file: Path | None = None
-    rate_hz: float = Field(default=1.0, gt=0, le=100)
+    password_file: Path | None = Field(default=None, description="holds the password")
+    rate_hz: float = Field(default=1.0, gt=0, le=100, description="messages in a second")
 
 
 class Prometheus(_Part):
@@ -164,6 +180,35 @@ def load_station(path: Path) -> StationConfig:
     """
     data: dict[str, Any] = read_toml(path)
     try:
-        return StationConfig.model_validate(data)
+        return _placed(StationConfig.model_validate(data), path.parent)
     except ValidationError as error:
         raise SystemConfigError(str(path), sentences(StationConfig, error)) from None
+
+
+def _placed(config: StationConfig, folder: Path) -> StationConfig:
+    """The same with relative paths counted from a folder."""
+
+    def at(path: Path | None) -> Path | None:
+        return None if path is None else folder / path.expanduser()
+
+    mqtt = config.controls.mqtt
+    mqtt = mqtt.model_copy(update={"password_file": at(mqtt.password_file)})
+    return config.model_copy(
+        update={
+            "folder": at(config.folder),
+            "server": config.server.model_copy(update={"token_file": at(config.server.token_file)}),
+            "controls": config.controls.model_copy(update={"mqtt": mqtt}),
+            "channel": [_placed_channel(channel, folder) for channel in config.channel],
+        }
+    )
+
+
+def _placed_channel(channel: ChannelConfig, folder: Path) -> ChannelConfig:
+    camera = channel.camera
+    source = [str(folder / Path(name).expanduser()) for name in camera.source]
+    system = channel.system
+    if system.endswith(".toml"):
+        system = str(folder / Path(system).expanduser())
+    return channel.model_copy(
+        update={"system": system, "camera": camera.model_copy(update={"source": source})}
+    )
