@@ -24,10 +24,13 @@ from rasnik.instrument import System
 
 __all__ = ["MovingImage"]
 
-# Distance of the rendered points, in units of the width of an edge (blur and pixel): the cubic
-# is then right to 2e-5 of the step from black to white.
+# Largest distance of the rendered points, in units of the width of an edge (blur and pixel): the
+# cubic is then right to 2e-5 of the step from black to white.
 _STEP_SIGMAS = 0.2
-_FEWEST_POINTS = 8
+# By how much, in the same unit, a cubic through points of a circle may shift the image: 0.02 nm
+# of SolidRas.
+_SHIFT_SIGMAS = 4e-6
+_FEWEST_POINTS = 16
 _MOST_BYTES = 512 << 20
 # The pattern is kept in whole steps of this, half a grey level of 14 bits.
 _UNIT = np.float32(1 / 20_000)
@@ -74,8 +77,11 @@ class MovingImage:
         moved_um = motion_um * system.optics.scale
         self._turn_rad = _TURN * moved_um / self._half_diagonal_um
         sigma_um = math.hypot(system.optics.blur_um, system.pitch_um / math.sqrt(12))
-        wanted = 2 * math.pi * moved_um * (1 + _TURN) / (_STEP_SIGMAS * sigma_um)
-        self._points = max(_FEWEST_POINTS, math.ceil(wanted)) if motion_um else 1
+        wanted = 1.0
+        if motion_um:
+            step_um = _step_um(moved_um, sigma_um)
+            wanted = max(_FEWEST_POINTS, 2 * math.pi * moved_um * (1 + _TURN) / step_um)
+        self._points = math.ceil(wanted)
         most = _MOST_BYTES // (2 * height * width)
         if self._points > most:
             raise ValueError(
@@ -170,6 +176,18 @@ class MovingImage:
             image = expected_image(self._system.mask, projection, pattern, self._camera)
             out[k] = np.rint(image / _UNIT)
         return out
+
+
+def _step_um(radius_um: float, sigma_um: float) -> float:
+    """Distance of the points to render on a circle on the sensor.
+
+    Of a function of the path s, the cubic lacks (3/128) h^4 times the fourth derivative. That of
+    the circle itself is 1 / radius^3. The third order of the image, s^2 along the circle times
+    s^2 / (2 radius) across it, adds a shift of 0.05 h^4 / (radius sigma^2).
+    """
+    path = (_SHIFT_SIGMAS * sigma_um * radius_um**3 / 0.0234) ** 0.25
+    image = (_SHIFT_SIGMAS * sigma_um**3 * radius_um / 0.05) ** 0.25
+    return min(_STEP_SIGMAS * sigma_um, path, image)
 
 
 @njit(cache=True, nogil=True, fastmath=True)
