@@ -14,6 +14,7 @@ from rasnik.cli.doctor import doctor_command
 from rasnik.cli.edges import edges_command
 from rasnik.cli.export import export_command
 from rasnik.cli.linearity import linearity_command
+from rasnik.cli.live import live_command
 from rasnik.cli.mask import mask_command
 from rasnik.cli.noise import noise_command
 from rasnik.cli.paper import paper_command
@@ -57,6 +58,7 @@ def _main(
 
 app.command("analyse")(analyse_command)
 app.command("track")(track_command)
+app.command("live")(live_command)
 app.command("export")(export_command)
 app.command("simulate")(simulate_command)
 app.command("systems")(systems_command)
