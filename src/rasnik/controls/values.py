@@ -123,7 +123,7 @@ _POSE = (
     Value("scale", "SCALE", "float", "", "image size / mask size", 9, True, lambda a: a.scale),
     Value(
         "theta_rad", "THETA", "float", "rad", "rotation, anticlockwise on the image", 9, True,
-        judged_by="theta_rel_mrad",
+        lambda a: _times(a.theta_mrad, 1 / _MRAD_PER_RAD),
     ),
     Value(
         "x_rel_nm", "XREL", "float", "nm", "x from its zero", 3, True,
@@ -139,7 +139,8 @@ _POSE = (
     ),
     Value(
         "theta_rel_mrad", "THETAREL", "float", "mrad", "rotation from its zero", 6, True,
-        lambda a: a.theta_mrad, source=lambda s: (s.theta_rad - s.zero_theta_rad) * _MRAD_PER_RAD,
+        judged_by="theta_rad",
+        source=lambda s: (s.theta_rad - s.zero_theta_rad) * _MRAD_PER_RAD,
     ),
     Value(
         "sigma_x_nm", "SIGMAX", "float", "nm", "standard deviation of x", 3, True,
