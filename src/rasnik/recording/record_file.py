@@ -126,11 +126,13 @@ class RecordFiles:
 
     def _check_space(self, size: int) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        free, least = free_mib(self.folder), self._options.keep_free_mib
-        if free < max(least, _SPARE_MIB + size / _MIB):
+        free = free_mib(self.folder)
+        least = max(self._options.keep_free_mib, _SPARE_MIB + size / _MIB)
+        if free < least:
             raise DiskError(
-                f"The disk is full: {free:.1f} MiB are free at {self.folder}, and recording keeps "
-                f"{least:g} MiB free. Make space; it goes on by itself."
+                f"The disk is full: {free:.1f} MiB are free at {self.folder}, less than the "
+                f"{least:.4g} MiB that recording needs or is to leave. Make space; it goes on by "
+                "itself."
             )
 
     def _ready(self, rows: NDArray[Any]) -> TrackWriter:
