@@ -19,12 +19,12 @@ from test_controls_values import STATUS, FakeStation
 Found = dict[tuple[str, str], Any]
 
 
-def scraped(text: str) -> Found:
+def scraped(text: str, station: str = "rasnik") -> Found:
     """Samples by name (that of a state follows it) and channel."""
     found: Found = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:
-            assert sample.labels["station"] == "rasnik"
+            assert sample.labels["station"] == station
             name = sample.name + sample.labels.get("state", "")
             key = name, sample.labels["channel"]
             assert key not in found

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args
 
 from rasnik.live.station import Alarms, ChannelConfig, StationConfig
 from rasnik.live.status import ChannelState, ChannelStatus
@@ -29,6 +29,10 @@ Kind = Literal["float", "count", "bool", "state", "text"]
 Limits = tuple[float, float]
 Content = float | int | bool | str
 
+# Numbers of numpy are made plain ones, which JSON takes.
+_PLAIN: dict[Kind, Callable[[Any], Content]] = {
+    "float": float, "count": int, "bool": bool, "state": str, "text": str,
+}  # fmt: skip
 STATES: tuple[str, ...] = get_args(ChannelState)
 _NM_PER_UM = 1e3
 _MRAD_PER_RAD = 1e3
@@ -102,9 +106,8 @@ class Value:
 
     def read(self, status: ChannelStatus) -> Content:
         """The value, from the status of a channel."""
-        found: Content
         found = getattr(status, self.name) if self.source is None else self.source(status)
-        return found
+        return _PLAIN[self.kind](found)
 
 
 def _times(limits: Limits | None, factor: float) -> Limits | None:
