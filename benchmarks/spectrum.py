@@ -73,13 +73,17 @@ def pulls(
 ) -> Any:
     """(found - true) / stated error of the noise floor in repeated runs, shape (runs,).
 
-    With `with_error` also (found - true) / true.
+    With `with_error` also (found - true) / true. Both are NaN where no floor was found.
     """
     true = math.sqrt(psd)
     rows = []
     for k in range(runs):
         spectrum = welch(make(np.random.default_rng([seed, k])))
-        floor = noise_floor(spectrum, find_lines(spectrum))
+        try:
+            floor = noise_floor(spectrum, find_lines(spectrum))
+        except ValueError:
+            rows.append((math.nan, math.nan))
+            continue
         rows.append(((floor.asd - true) / floor.sigma, floor.asd / true - 1))
     found, relative = np.array(rows).T
     return (found, relative) if with_error else found
@@ -115,7 +119,10 @@ def main() -> None:
         ("y, full light, 275 Hz", sigma, 275.0, RESONANCES),
         ("y, full light, 100 Hz", sigma, 100.0, RESONANCES),
     )
-    print(f"{'':24}{'bound':>8}{'floor':>8}{'scatter':>9}{'worst':>8}{'pull':>16}   pm/sqrt(Hz)")
+    print(
+        f"{'':24}{'bound':>8}{'floor':>8}{'scatter':>9}{'worst':>8}{'pull':>16}{'none':>7}"
+        "   pm/sqrt(Hz)"
+    )
     record, floors = {}, []
     for k, (name, per_frame, rate_hz, swings) in enumerate(kinds):
         n = int(HALF_HOUR_S * rate_hz)
@@ -127,16 +134,18 @@ def main() -> None:
             ),
             psd, seed=options.seed + k, with_error=True,
         )  # fmt: skip
-        limit_pm = 1e3 * math.sqrt(psd)
+        limit_pm, none = 1e3 * math.sqrt(psd), int(np.isnan(found).sum())
+        found, relative = found[np.isfinite(found)], relative[np.isfinite(relative)]
         floors.append(limit_pm * (1 + relative.mean()))
         record[name] = {
             "bound_pm_rthz": limit_pm, "floor_pm_rthz": floors[-1],
             "scatter": float(relative.std()), "worst": float(np.abs(relative).max()),
-            "pull_mean": float(found.mean()), "pull_std": float(found.std()),
+            "pull_mean": float(found.mean()), "pull_std": float(found.std()), "none": none,
         }  # fmt: skip
         print(
             f"{name:24}{limit_pm:8.2f}{floors[-1]:8.2f}{100 * relative.std():8.2f}%"
             f"{100 * np.abs(relative).max():7.2f}%{found.mean():8.2f} ± {found.std():.2f}"
+            f"{none:7}"
         )
     print(
         f"half light / full: {floors[1] / floors[0]:.4f} (bound {dim / sigma:.4f}; shot noise "

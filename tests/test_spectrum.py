@@ -20,7 +20,7 @@ from rasnik.characterisation.spectrum import coherence, logarithmic, welch, wind
 from rasnik.characterisation.track_spectrum import bound_of, track_spectrum
 from rasnik.io import write_track
 from rasnik.report.spectrum import plot_spectra, shown_unit
-from spectrum import RESONANCES_X, instrument_series, pulls
+from spectrum import RESONANCES, RESONANCES_X, instrument_series, pulls
 from test_cli import rasnik, refused
 
 RATE = 275.0
@@ -345,6 +345,16 @@ def test_irregular_times_are_refused_or_used(rng):
     strongest = max(found.lines, key=lambda line: line.significance)
     assert strongest.frequency_hz == pytest.approx(31, abs=0.3)
     assert strongest.rms == pytest.approx(0.5 / math.sqrt(2), abs=3 * strongest.rms_error)
+
+
+def test_a_floor_that_does_not_stand_out_is_not_told():
+    """A resonance near the Nyquist frequency covers it: the fitted floor came out below zero."""
+    rng, rate_hz = np.random.default_rng([5, 60]), 100.0
+    sigma = bound(load_system("solidras"), (4000.0, 5000.0, 0.0), rounding=True).sigma_x_nm
+    series = instrument_series(rng, 180_000, rate_hz, sigma, resonances=RESONANCES)
+    spectrum = welch(series)
+    with pytest.raises(ValueError, match="does not stand out"):
+        noise_floor(spectrum, find_lines(spectrum))
 
 
 def test_what_cannot_be_done_is_said(rng):

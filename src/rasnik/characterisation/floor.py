@@ -22,6 +22,7 @@ from rasnik.characterisation.spectrum import Spectrum
 __all__ = ["NoiseFloor", "noise_floor"]
 
 _BANDS = 60
+_LEAST_SIGMAS = 3  # of the squared floor; what is less certain is none
 _LEAST_BINS = 24  # in a band
 _LEAST_BANDS = 3  # that agree, for a floor to be one
 _SLOPE_BANDS = 8  # from which a remainder can be fitted too
@@ -103,7 +104,7 @@ def noise_floor(
     Raises
     ------
     ValueError
-        If there are too few bins, or no flat part.
+        If there are too few bins, or no flat part, or one that cannot be told from the rest.
     """
     bins = _free_bins(spectrum, lines, range_hz)
     if len(bins) < _LEAST_BINS:
@@ -125,6 +126,11 @@ def noise_floor(
         raise ValueError("the spectrum has no flat part; name the range of the floor")
     middle = np.array([spectrum.frequency_hz[band].mean() for band in bands])
     psd, error, chi2_ndf = _fit(middle[flat], levels[flat], relative[flat], slope=range_hz is None)
+    if not psd > _LEAST_SIGMAS * error:
+        raise ValueError(
+            "the noise floor does not stand out from what falls with frequency; "
+            "name its range, or take a longer track"
+        )
     used = np.concatenate([band for band, taken in zip(bands, flat, strict=True) if taken])
     asd = math.sqrt(psd)
     return NoiseFloor(
