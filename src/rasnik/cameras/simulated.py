@@ -239,9 +239,10 @@ class SimulatedCamera(Camera):
         """
         with self._changed:
             index = number - self._first_number
-            if self.number_wraps_at is not None:
-                index += (self._handed - index) // self.number_wraps_at * self.number_wraps_at
-            if not 0 <= index <= self._handed:
+            wraps_at = self.number_wraps_at
+            if wraps_at is not None and 1 <= number <= wraps_at:
+                index += (self._handed - index) // wraps_at * wraps_at
+            if not 0 <= index <= self._handed or number > (wraps_at or number):
                 raise ValueError(f"frame {number} has not been read since the camera was opened")
             device_s = self._stretch(index).device_time_s(index)
         return self.truth_at(device_s)
