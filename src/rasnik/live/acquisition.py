@@ -11,6 +11,7 @@ from rasnik.cameras.camera import (
     CameraError,
     CameraFrame,
     CameraLostError,
+    CameraSettings,
     SettingRefusedError,
     SourceEndedError,
 )
@@ -74,6 +75,12 @@ class Acquisition:
     def stop(self) -> None:
         """Ask the thread to end; `join` waits for it."""
         self._stopping.set()
+
+    def change(self, settings: CameraSettings) -> CameraSettings:
+        """Change settings of the camera; what is in force afterwards."""
+        changed = self.camera.change(settings)
+        self.losses.change_pace()
+        return changed
 
     def join(self, timeout_s: float) -> bool:
         """Whether the thread has ended within the time."""

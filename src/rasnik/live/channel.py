@@ -211,7 +211,7 @@ class Channel:
         SettingRefusedError
         """
         self._keep_exposure = False
-        self._camera.change(CameraSettings(exposure_us=us))
+        self._acquisition.change(CameraSettings(exposure_us=us))
 
     def keep_exposure(self, on: bool) -> None:
         """Whether the exposure is kept where the brightest fields are just below full scale."""

@@ -15,7 +15,7 @@ __all__ = ["Arrival", "Losses"]
 _INTERVALS = 16  # of which the usual one is the median
 _KNOWN_AFTER = 8  # intervals, before frames are missed by time
 _LATE = 0.75  # periods; a frame later than that comes instead of the one that was expected
-_FORGET = 1 / 32  # of the lateness, per frame: clocks drift
+_FORGET = 1 / 8  # of the lateness, per frame: clocks drift, and the period is not known well
 _REPAID_WITHIN = 64  # frames, in which frames that were thought lost may still come
 _CLOCK_JUMP_S = 2.0  # by which the camera's clock gains on the host's: it was set
 _ODD_GAP = 1000  # frames, beyond twice what fits in the time: the camera began to count anew
@@ -75,7 +75,7 @@ class Losses:
         self._last: CameraFrame | None = None
         self._host_time_s = math.nan
         self._forget_times()
-        self._continued = False
+        self._continued = self._pace_changed = False
 
     def restart(self) -> None:
         """The camera was connected again: it may count anew, and its clock may have been set."""
@@ -83,9 +83,16 @@ class Losses:
         self._forget_times()
         self._continued = self.frames > 0
 
+    def change_pace(self) -> None:
+        """The camera was told something that may change its rate, which is learnt anew."""
+        self._pace_changed = True
+
     def add(self, frame: CameraFrame) -> Arrival:
         """Number a frame, and count what is missing before it."""
         flags = Flag.NONE
+        if self._pace_changed:
+            self._pace_changed = False
+            self._forget_times()
         if self._continued:
             passed = 1 + self._missed_while_away(frame)
         else:
