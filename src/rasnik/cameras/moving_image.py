@@ -1,6 +1,6 @@
 """Noisy frames of a moving mask, made faster than a camera takes them.
 
-The mask goes round a closed loop of poses. The expected pattern is rendered once at points of
+The mask goes round a closed loop of poses. The expected pattern is rendered, once, at points of
 that loop which lie so close that a cubic through four of them gives the pattern in between; a
 frame is that cubic, its grey levels, and noise. Noise comes from a pool of normal numbers: each
 row of each frame begins at a random place in it, with a random sign, so that two frames have
@@ -10,6 +10,7 @@ nothing in common on the average.
 from __future__ import annotations
 
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -89,11 +90,24 @@ class MovingImage:
                 f"motion_um of {motion_um * most / wanted:.2g} at most"
             )
         self._check_on_mask()
-        self._rendered = self._render()
+        self._rendered = np.empty((self._points, height, width), np.int16)
+        self._ready = np.zeros(self._points, bool)
         rng = np.random.default_rng(seed)
         pool = rng.standard_normal(_POOL, dtype=np.float32)
         self._pool = (pool - pool.mean()) / pool.std()
         self.frame(0.0, 1.0, 1.0, 0)  # compiled here, not while frames wait
+
+    def prepare(self, phase: float, longest_s: float) -> None:
+        """Render the points after a phase, until all are or the time is over.
+
+        The others are rendered when they are first needed, which delays that frame.
+        """
+        end_s = time.perf_counter() + longest_s
+        (first, *_), _ = self._nearest(phase)
+        for k in range(self._points):
+            if time.perf_counter() > end_s:
+                return
+            self._render((first + k) % self._points)
 
     def truth(self, phase: float) -> Truth:
         """The pose at a phase, in radians."""
@@ -133,6 +147,8 @@ class MovingImage:
         law = self._system.noise_law
         assert law is not None
         (a, b, c, d), weights = self._nearest(phase)
+        for point in (a, b, c, d):
+            self._render(point)
         dark = brightness * sensor.dark_level
         step = brightness * (sensor.light_level - sensor.dark_level) * float(_UNIT)
         out = np.empty(self._system.shape, frame_dtype(self._system))
@@ -167,15 +183,14 @@ class MovingImage:
         for quarter in range(4):
             self.truth(quarter * math.pi / 2)
 
-    def _render(self) -> NDArray[np.int16]:
-        optics = self._system.optics
-        pattern = Appearance.uniform(0.0, 1.0, optics.blur_um)
-        out = np.empty((self._points, *self._system.shape), np.int16)
-        for k in range(self._points):
-            projection = self.truth(2 * math.pi * k / self._points).projection
-            image = expected_image(self._system.mask, projection, pattern, self._camera)
-            out[k] = np.rint(image / _UNIT)
-        return out
+    def _render(self, point: int) -> None:
+        if self._ready[point]:
+            return
+        system, phase = self._system, 2 * math.pi * point / self._points
+        pattern = Appearance.uniform(0.0, 1.0, system.optics.blur_um)
+        image = expected_image(system.mask, self.truth(phase).projection, pattern, self._camera)
+        self._rendered[point] = np.rint(image / _UNIT)
+        self._ready[point] = True
 
 
 def _step_um(radius_um: float, sigma_um: float) -> float:

@@ -27,6 +27,7 @@ _USUAL_RATE_HZ = 275.0
 _RATES_HZ = (0.01, 10_000.0)
 _SHORTEST_US = 1.0
 _GAINS_DB = (0.0, 24.0)
+_PREPARED_S = 1.0
 #: Frames that wait for a reader; older ones are lost.
 _BUFFERS = 50
 _GOLDEN = (math.sqrt(5) - 1) / 2
@@ -133,6 +134,7 @@ class SimulatedCamera(Camera):
                 self._image = MovingImage(self._system, self._motion_um, self._seed)
             except ValueError as error:
                 raise SettingRefusedError(f"the camera cannot be simulated: {error}.") from None
+            self._image.prepare(self._phase(_POWERED_S), _PREPARED_S)
         with self._changed:
             if self._open and not self._lost:
                 return
