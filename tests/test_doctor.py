@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from rasnik.cameras.aravis import SeenCamera
 from rasnik.cameras.camera import CameraMissingError
 from rasnik.cli import app
 from rasnik.live import doctor
@@ -33,6 +34,7 @@ from rasnik.live.checks import (
 from rasnik.live.checks.finding import Finding, Machine, guarded
 from rasnik.live.station import StationConfig
 from rasnik.live.unit import service_unit
+from rasnik.web.server import read_token
 
 ARAVIS = {"kind": "aravis", "device": "CAM-1"}
 PROJECT = Path(__file__).resolve().parents[1] / "pyproject.toml"
@@ -116,6 +118,7 @@ def test_what_the_station_needs_is_a_fault_if_missing(monkeypatch: pytest.Monkey
     levels = {finding.about: finding.level for finding in packages.extras(config)}
     assert levels["extra live"] == levels["extra mqtt"] == levels["opencv"] == "fault"
     assert levels["extra camera"] == levels["extra epics"] == levels["extra parquet"] == "note"
+    assert levels["extra prometheus"] == "note", "not asked for in so many words"
     camera = {finding.about: finding for finding in packages.extras(station(ARAVIS))}[
         "extra camera"
     ]
@@ -391,24 +394,50 @@ def test_addresses(tmp_path: Path) -> None:
     assert everywhere[1].level == "fault" and "token_file" in everywhere[1].remedy
 
 
+TOKEN = "0123456789abcdef0123"
+
+
 @pytest.mark.parametrize(
-    ("text", "mode", "level", "words"),
+    ("text", "mode", "level", "remedy"),
     [
-        ("Tr0ub4dor", 0o600, "ok", "owner alone"),
-        ("Tr0ub4dor", 0o644, "warning", "mode 644"),
-        (" \n", 0o600, "fault", "empty"),
-        (None, 0, "fault", "no file"),
+        (TOKEN, 0o600, "ok", ""),
+        (TOKEN, 0o644, "fault", "chmod 600"),
+        (" \n", 0o600, "fault", "(umask 077; openssl rand"),
+        (None, 0, "fault", "(umask 077; openssl rand"),
     ],
     ids=["good", "open", "empty", "missing"],
 )
-def test_token_file(tmp_path: Path, text: str | None, mode: int, level: str, words: str) -> None:
-    file = tmp_path / "token"
+def test_token_file(tmp_path: Path, text: str | None, mode: int, level: str, remedy: str) -> None:
+    config = station(server={"token_file": secret(tmp_path, text, mode)})
+    finding = only(services.token_file(config, read_token))
+    assert finding.level == level and finding.remedy.startswith(remedy)
+    assert TOKEN not in finding.found + finding.remedy
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "level"),
+    [
+        ("Tr0ub4dor", 0o600, "ok"),
+        ("Tr0ub4dor", 0o640, "warning"),
+        ("", 0o600, "fault"),
+        (None, 0, "fault"),
+    ],
+    ids=["good", "open", "empty", "missing"],
+)
+def test_password_file(tmp_path: Path, text: str | None, mode: int, level: str) -> None:
+    file = secret(tmp_path, text, mode)
+    config = station(controls={"mqtt": {"enabled": True, "password_file": file}})
+    finding = only(services.password_file(config))
+    assert finding.level == level and str(file) in finding.found
+    assert "Tr0ub4dor" not in finding.found + finding.remedy
+
+
+def secret(folder: Path, text: str | None, mode: int) -> Path:
+    file = folder / "key"
     if text is not None:
         file.write_text(text)
         file.chmod(mode)
-    finding = only(services.secrets(station(server={"token_file": file})))
-    assert finding.level == level and words in finding.found
-    assert "Tr0ub4dor" not in finding.found + finding.remedy
+    return file
 
 
 def test_broker() -> None:
@@ -425,7 +454,7 @@ def test_broker() -> None:
 
 # ------------------------------------------------------------------------------ cameras
 
-SEEN = [SimpleNamespace(vendor="Maker", model="M1", serial="CAM-1", address="10.0.0.2")]
+SEEN = [SeenCamera("Maker-CAM-1", "Maker", "M1", "CAM-1", "10.0.0.2", "GigEVision")]
 MISSING = CameraMissingError("Install Aravis.")
 
 
@@ -433,9 +462,13 @@ MISSING = CameraMissingError("Install Aravis.")
     ("camera", "seen", "level", "words"),
     [
         ({}, [], "ok", "simulated"),
-        (ARAVIS, SEEN, "ok", "Maker M1 CAM-1"),
+        (ARAVIS, SEEN, "ok", "CAM-1"),
         (ARAVIS | {"device": "10.0.0.2"}, SEEN, "ok", "Maker"),
         (ARAVIS | {"device": "CAM-2"}, SEEN, "fault", "not among those seen"),
+        (ARAVIS | {"device": ""}, SEEN, "ok", "Maker"),
+        (ARAVIS | {"device": "CAM"}, SEEN, "fault", "not among those seen"),
+        (ARAVIS | {"device": "10.0.0.3"}, SEEN, "warning", "did not answer"),
+        (ARAVIS | {"device": "10.0.0.3"}, MISSING, "fault", "needs Aravis"),
         (ARAVIS, [], "fault", "not seen"),
         (ARAVIS, MISSING, "fault", "needs Aravis"),
         ({"kind": "opencv", "device": "0"}, [], "ok", "/dev/video0"),
@@ -456,7 +489,7 @@ def test_cameras_that_are_seen(tmp_path: Path) -> None:
     files = {"/dev/video0": "", "/dev/videos": "", "/sys/class/video4linux/video0/name": "Webcam"}
     computer = a_machine(tmp_path, files)
     first, second = cameras.seen(computer, SEEN)
-    assert first.found == "Maker M1 CAM-1 10.0.0.2"
+    assert "CAM-1" in first.found and "10.0.0.2" in first.found
     assert second.found == "/dev/video0 Webcam"
     assert next(iter(cameras.seen(computer, MISSING))).remedy == "Install Aravis."
     assert next(iter(cameras.seen(computer, []))).level == "note"
@@ -545,6 +578,11 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cameras, "aravis_cameras", lambda: [])
 
 
+def examined(folder: Path, **options: Any) -> Iterable[Finding]:
+    config = station({"region": (0, 0, 240, 180)}, folder=folder)
+    return doctor.examine(config, read_token=read_token, **options)
+
+
 def write_station(folder: Path, text: str = "") -> Path:
     file = folder / "station.toml"
     start = f'folder = "{(folder / "data").as_posix()}"\n[server]\nport = 0\n'
@@ -561,9 +599,7 @@ def test_nothing_stops_the_examination(
     for module, name in ((packages, "python"), (machine, "clock"), (disk, "free_space")):
         monkeypatch.setattr(module, name, broken)
     monkeypatch.setattr(cameras, "aravis_cameras", broken)
-    findings = list(
-        doctor.examine(station(folder=tmp_path), quick=True, computer=Machine(tmp_path))
-    )
+    findings = list(examined(tmp_path, quick=True, computer=Machine(tmp_path)))
     failed = {finding.about for finding in findings if "out of order" in finding.found}
     assert failed == {"python", "clock", "disk space"}
     assert any("out of order" in finding.remedy for finding in findings)
@@ -589,9 +625,9 @@ def test_exit_status_tells_of_a_fault(tmp_path: Path, quiet: None) -> None:
 
 
 def test_measured_as_a_whole(tmp_path: Path, quiet: None) -> None:
-    findings = {each.about: each for each in doctor.examine(station(folder=tmp_path))}
+    findings = {each.about: each for each in examined(tmp_path)}
     assert "MiB/s" in findings["disk speed"].found
-    assert "frames/s of 720 x 540" in findings["analysis one"].found
+    assert "frames/s of 240 x 180" in findings["analysis one"].found
 
 
 def test_wrong_usage(tmp_path: Path) -> None:

@@ -58,10 +58,11 @@ def doctor_command(
     config = _config(station)
 
     from rasnik.live.doctor import examine
+    from rasnik.web.server import read_token
 
     findings = []
     with messages().status("looking") as status:
-        for finding in examine(config, quick=quick):
+        for finding in examine(config, read_token=read_token, quick=quick):
             findings.append(finding)
             status.update(f"looked at {finding.about}")
     if as_json:

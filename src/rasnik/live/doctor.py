@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rasnik.cameras.camera import CameraError, CameraMissingError
 from rasnik.live.checks import cameras, disk, machine, network, packages, services
 from rasnik.live.checks.finding import Finding, Machine, guarded
 from rasnik.live.station import StationConfig
 
+if TYPE_CHECKING:
+    from rasnik.cameras.aravis import SeenCamera
+
 __all__ = ["examine"]
 
 
 def examine(
-    config: StationConfig, *, quick: bool = False, computer: Machine | None = None
+    config: StationConfig,
+    *,
+    read_token: Callable[[Path], object],
+    quick: bool = False,
+    computer: Machine | None = None,
 ) -> Iterator[Finding]:
     """Look at everything a station needs.
 
     Parameters
     ----------
     config : StationConfig
+    read_token : callable
+        Reads a token file as the page does, and raises if it would not be accepted.
     quick : bool, optional
         Whether to leave out what has to be measured: disk and analysis.
     computer : Machine, optional
@@ -50,7 +60,8 @@ def examine(
         ("disk space", lambda: disk.free_space(config)),
         ("file system", lambda: disk.file_system(computer, config)),
         ("port", lambda: services.port(config)),
-        ("token file", lambda: services.secrets(config)),
+        ("token file", lambda: services.token_file(config, read_token)),
+        ("password file", lambda: services.password_file(config)),
         ("MQTT broker", lambda: services.broker(config)),
     ]
     if not quick:
@@ -60,7 +71,7 @@ def examine(
         yield from guarded(about, check)
 
 
-def _cameras() -> list[Any] | CameraError:
+def _cameras() -> list[SeenCamera] | CameraError:
     try:
         return cameras.aravis_cameras()
     except CameraError as error:

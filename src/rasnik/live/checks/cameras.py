@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from rasnik._config import SystemConfigError
 from rasnik.cameras.camera import CameraError
 from rasnik.live.checks.finding import Finding, Machine
 from rasnik.live.checks.rates import system_of
+from rasnik.live.checks.services import is_address
 from rasnik.live.station import ChannelConfig, StationConfig
+
+if TYPE_CHECKING:
+    from rasnik.cameras.aravis import SeenCamera
 
 __all__ = ["aravis_cameras", "channels", "seen", "video_devices"]
 
 
-def aravis_cameras() -> list[Any]:
+def aravis_cameras() -> list[SeenCamera]:
     """Cameras of the network and of USB, as Aravis sees them.
 
     Raises
@@ -25,7 +29,7 @@ def aravis_cameras() -> list[Any]:
     """
     from rasnik.cameras.aravis import list_cameras
 
-    return list(list_cameras())
+    return list_cameras()
 
 
 def video_devices(machine: Machine) -> dict[str, str]:
@@ -38,7 +42,7 @@ def video_devices(machine: Machine) -> dict[str, str]:
     }
 
 
-def seen(machine: Machine, cameras: Sequence[Any] | CameraError) -> Iterator[Finding]:
+def seen(machine: Machine, cameras: Sequence[SeenCamera] | CameraError) -> Iterator[Finding]:
     """Every camera that there is."""
     if isinstance(cameras, CameraError):
         yield Finding(
@@ -56,22 +60,13 @@ def seen(machine: Machine, cameras: Sequence[Any] | CameraError) -> Iterator[Fin
         )
     else:
         for camera in cameras:
-            yield Finding("cameras", "ok", _described(camera))
+            yield Finding("cameras", "ok", str(camera))
     for path, name in video_devices(machine).items():
         yield Finding("video devices", "ok", f"{path} {name}".strip())
 
 
-def _described(camera: Any) -> str:
-    return camera if isinstance(camera, str) else " ".join(filter(None, _words(camera)))
-
-
-def _words(camera: Any) -> list[str]:
-    names = ("vendor", "model", "serial", "address", "protocol", "device_id")
-    return [str(value) for name in names if (value := getattr(camera, name, None))]
-
-
 def channels(
-    machine: Machine, config: StationConfig, cameras: Sequence[Any] | CameraError
+    machine: Machine, config: StationConfig, cameras: Sequence[SeenCamera] | CameraError
 ) -> Iterator[Finding]:
     """For each channel, whether its system and its camera are there."""
     for channel in config.channel:
@@ -93,7 +88,7 @@ def _camera(
     about: str,
     machine: Machine,
     channel: ChannelConfig,
-    cameras: Sequence[Any] | CameraError,
+    cameras: Sequence[SeenCamera] | CameraError,
     start: str,
 ) -> Finding:
     camera = channel.camera
@@ -127,9 +122,22 @@ def _webcam(about: str, machine: Machine, device: str, start: str) -> Finding:
     return Finding(about, "ok", f"{start}webcam {path}, not for metrology")
 
 
-def _aravis(about: str, device: str, cameras: Sequence[Any] | CameraError, start: str) -> Finding:
+def _aravis(
+    about: str, device: str, cameras: Sequence[SeenCamera] | CameraError, start: str
+) -> Finding:
     if isinstance(cameras, CameraError):
         return Finding(about, "fault", "its camera needs Aravis, which is missing", str(cameras))
+    for camera in cameras:
+        if device in {"", camera.device_id, camera.serial, camera.address, camera.model}:
+            return Finding(about, "ok", f"{start}{camera}")
+    if is_address(device):
+        return Finding(
+            about,
+            "warning",
+            f"its camera {device} did not answer when all cameras were asked; one of another "
+            "network does not hear that",
+            f"See whether it is there: ping {device}",
+        )
     if not cameras:
         return Finding(
             about,
@@ -137,10 +145,6 @@ def _aravis(about: str, device: str, cameras: Sequence[Any] | CameraError, start
             f"its camera {device or '(any)'} is not seen, nor any other",
             "See its power and cable, and that its address is one of this machine's networks.",
         )
-    for camera in cameras:
-        words = [camera] if isinstance(camera, str) else _words(camera)
-        if any(device.lower() in word.lower() for word in words):
-            return Finding(about, "ok", f"{start}{_described(camera)}")
     return Finding(
         about,
         "fault",

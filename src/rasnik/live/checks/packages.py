@@ -46,7 +46,7 @@ EXTRAS = {
     "camera": Extra(
         "GigE Vision and USB3 Vision cameras",
         {"PyGObject": "gi"},
-        "sudo apt install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev && ",
+        "sudo apt install gir1.2-aravis-0.8 libgirepository1.0-dev libcairo2-dev python3-dev && ",
     ),
     "epics": Extra("EPICS process variables", {"softioc": "softioc"}),
     "mqtt": Extra("messages to an MQTT broker", {"paho-mqtt": "paho.mqtt"}),
@@ -114,7 +114,9 @@ def needed_extras(config: StationConfig) -> set[str]:
         "camera": any(channel.camera.kind == "aravis" for channel in config.channel),
         "epics": controls.epics.enabled,
         "mqtt": controls.mqtt.enabled,
-        "prometheus": controls.prometheus.enabled,
+        # on by default: missed only by those who ask for it
+        "prometheus": controls.prometheus.enabled
+        and "enabled" in controls.prometheus.model_fields_set,
     }
     return {name for name, needed in wanted.items() if needed}
 

@@ -7,13 +7,13 @@ import ipaddress
 import os
 import socket
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from rasnik.live.checks.finding import Finding
 from rasnik.live.station import StationConfig
 
-__all__ = ["broker", "port", "secrets"]
+__all__ = ["broker", "is_address", "is_loopback", "password_file", "port", "token_file"]
 
 _BROKER_S = 3.0
 
@@ -70,46 +70,63 @@ def _refused(error: OSError, where: str) -> tuple[str, str]:
 
 def is_loopback(host: str) -> bool:
     """Whether only this machine reaches an address."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
+    if not is_address(host):
         return host == "localhost"
+    return ipaddress.ip_address(host).is_loopback
 
 
-def secrets(config: StationConfig) -> Iterator[Finding]:
-    """Files with a token or password: there, not empty, and for nobody else to read."""
-    files = {
-        "token file": config.server.token_file,
-        "password file": config.controls.mqtt.password_file,
-    }
-    for about, path in files.items():
-        if path is not None:
-            yield _secret(about, path)
-
-
-def _secret(about: str, path: Path) -> Finding:
-    make = f"(umask 077; openssl rand -hex 24 > '{path}')"
-    if about != "token file":
-        make = f"Write the password into {path}, a file of its own."
+def is_address(host: str) -> bool:
+    """Whether it is a numeric address, not a name."""
     try:
-        mode, text = path.stat().st_mode, path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return Finding(about, "fault", f"there is no file {path}", make)
-    except PermissionError:
-        return Finding(
-            about,
-            "fault",
-            f"{path} cannot be read by this user",
-            f"sudo chown $USER '{path}'",
-        )
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def token_file(config: StationConfig, read_token: Callable[[Path], object]) -> Iterator[Finding]:
+    """Whether the page will accept the file with its token."""
+    path = config.server.token_file
+    if path is None:
+        return
+    try:
+        read_token(path)
+    except Exception as error:
+        remedy = f"(umask 077; openssl rand -hex 24 > '{path}')"
+        if path.is_file() and _open_to_others(path):
+            remedy = f"chmod 600 '{path}'"
+        yield Finding("token file", "fault", " ".join(str(error).split()), remedy)
+    else:
+        yield Finding("token file", "ok", f"{path}, for its owner alone")
+
+
+def password_file(config: StationConfig) -> Iterator[Finding]:
+    """Whether the password for the broker is there, and for nobody else to read."""
+    path = config.controls.mqtt.password_file
+    if path is None:
+        return
+    try:
+        empty = not path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError) as error:
-        return Finding(about, "fault", f"{path} cannot be read: {error}", make)
-    if not text.strip():
-        return Finding(about, "fault", f"{path} is empty", make)
-    if os.name == "posix" and mode & (stat.S_IRWXG | stat.S_IRWXO):
-        found = f"{path} can be read by others (mode {stat.S_IMODE(mode):03o})"
-        return Finding(about, "warning", found, f"chmod 600 '{path}'")
-    return Finding(about, "ok", f"{path}, for its owner alone")
+        yield Finding(
+            "password file",
+            "fault",
+            f"{path} cannot be read: {getattr(error, 'strerror', None) or 'it is not text'}",
+            f"Write the password into {path}, as the user who runs the station.",
+        )
+        return
+    if empty:
+        remedy = f"Write the password into {path}."
+        yield Finding("password file", "fault", f"{path} is empty", remedy)
+    elif _open_to_others(path):
+        found = f"{path} can be read by others"
+        yield Finding("password file", "warning", found, f"chmod 600 '{path}'")
+    else:
+        yield Finding("password file", "ok", f"{path}, for its owner alone")
+
+
+def _open_to_others(path: Path) -> bool:
+    return os.name == "posix" and bool(path.stat().st_mode & (stat.S_IRWXG | stat.S_IRWXO))
 
 
 def broker(config: StationConfig, timeout_s: float = _BROKER_S) -> Iterator[Finding]:
