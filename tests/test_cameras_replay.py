@@ -84,6 +84,16 @@ def test_stacks_and_datasets(images: NDArray[np.uint8], tmp_path: Path) -> None:
     assert math.isnan(frames[0].device_time_s)
 
 
+def test_frames_that_were_kept_beside_their_poses(
+    images: NDArray[np.uint8], tmp_path: Path
+) -> None:
+    with h5py.File(tmp_path / "event.h5", "w") as file:
+        file["frames"] = images
+        file["poses"] = np.zeros(6, [("frame", np.int64), ("x_um", float)])
+    frames = all_frames(full(tmp_path / "event.h5"))
+    assert [(f.image == i).all() for f, i in zip(frames, images, strict=True)] == [True] * 6
+
+
 def test_a_video(images: NDArray[np.uint8], tmp_path: Path) -> None:
     av = pytest.importorskip("av")
     with av.open(str(tmp_path / "v.mkv"), "w") as container:

@@ -100,7 +100,7 @@ def test_noise_of_frames_and_of_neighbours_is_independent() -> None:
 
 
 def test_tracking_noise_is_at_the_bound(moving: MovingImage) -> None:
-    tracker, n = Tracker(FULL), 500
+    tracker, n = Tracker(FULL), 400
     pulls = []
     for k in range(n):
         phase = 2 * math.pi * 0.3 * k / 275
@@ -282,6 +282,20 @@ def test_exposure_gain_and_light_are_obeyed() -> None:
     camera.light = 0
     settled()
     assert read(camera, 1)[0].image.max() < 6
+    camera.close()
+
+
+def test_settings_that_change_for_ever_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rasnik.cameras.simulated._REMEMBERED", 3)
+    camera = SimulatedCamera(SMALL, frame_rate_hz=100.0)
+    camera.open()
+    for k in range(6):
+        (frame,) = read(camera, 1)
+        camera.change(CameraSettings(frame_rate_hz=100.0 + k))
+    assert len(camera._stretches) == 3
+    assert camera.truth(frame.number) == camera.truth_at(frame.device_time_s)
+    with pytest.raises(ValueError, match="frame 1 has not been read, or too long ago"):
+        camera.truth(1)
     camera.close()
 
 

@@ -28,6 +28,7 @@ _RATES_HZ = (0.01, 10_000.0)
 _SHORTEST_US = 1.0
 _GAINS_DB = (0.0, 24.0)
 _PREPARED_S = 1.0
+_REMEMBERED = 10_000  # changes of the settings
 #: Frames that wait for a reader; older ones are lost.
 _BUFFERS = 50
 _GOLDEN = (math.sqrt(5) - 1) / 2
@@ -115,7 +116,8 @@ class SimulatedCamera(Camera):
         _check_light(light)
         # Cameras of one station are not to move as one.
         turns = _GOLDEN * seed % 1.0
-        self._stretches = [_Stretch(0, _POWERED_S, turns, rate_hz, exposure_us, gain_db, light)]
+        self._begun = _Stretch(0, _POWERED_S, turns, rate_hz, exposure_us, gain_db, light)
+        self._stretches = [self._begun]
         self._image: MovingImage | None = None
         self._changed = threading.Condition()
         self._open = self._lost = False
@@ -141,14 +143,15 @@ class SimulatedCamera(Camera):
             now_s = time.perf_counter()
             if now_s < self._away_until_s:
                 raise CameraMissingError(f"{self.name} is not there; connect it again.")
-            last = self._stretches[-1]
+            last, begun = self._stretches[-1], self._begun
             if math.isnan(self._powered_s):
                 self._powered_s, device_s = now_s, _POWERED_S
             else:
                 device_s = _POWERED_S + now_s - self._powered_s
-            turns = last.turns + (device_s - last.device_s) * self._motion_hz
+            turns = begun.turns + (device_s - begun.device_s) * self._motion_hz
             asked = self._accepted(last, self._asked)
-            self._stretches = [replace(asked, first=0, device_s=device_s, turns=turns)]
+            self._begun = replace(asked, first=0, device_s=device_s, turns=turns)
+            self._stretches = [self._begun]
             self._started_s, self._next, self._handed = now_s, 0, -1
             self._open, self._lost = True, False
 
@@ -237,15 +240,16 @@ class SimulatedCamera(Camera):
         Raises
         ------
         ValueError
-            If no such frame has been read yet.
+            If no such frame has been read yet, or settings have changed too often since.
         """
         with self._changed:
             index = number - self._first_number
             wraps_at = self.number_wraps_at
             if wraps_at is not None and 1 <= number <= wraps_at:
                 index += (self._handed - index) // wraps_at * wraps_at
-            if not 0 <= index <= self._handed or number > (wraps_at or number):
-                raise ValueError(f"frame {number} has not been read since the camera was opened")
+            first = self._stretches[0].first
+            if not first <= index <= self._handed or number > (wraps_at or number):
+                raise ValueError(f"frame {number} has not been read, or too long ago")
             device_s = self._stretch(index).device_time_s(index)
         return self.truth_at(device_s)
 
@@ -286,13 +290,13 @@ class SimulatedCamera(Camera):
 
     def _due_s(self, index: int) -> float:
         """When a frame comes, by `time.perf_counter`."""
-        begun_s = self._stretches[0].device_s
-        return self._started_s + self._stretch(index).device_time_s(index) - begun_s
+        since_s = self._stretch(index).device_time_s(index) - self._begun.device_s
+        return self._started_s + since_s
 
     def _due(self, now_s: float) -> int:
         """Number of frames that have come until now, those lost included."""
         last = self._stretches[-1]
-        elapsed_s = now_s - self._started_s + self._stretches[0].device_s - last.device_s
+        elapsed_s = now_s - self._started_s + self._begun.device_s - last.device_s
         return max(last.first, last.first + math.floor(elapsed_s * last.rate_hz) + 1)
 
     def _stretch(self, index: int) -> _Stretch:
@@ -300,7 +304,7 @@ class SimulatedCamera(Camera):
         return self._stretches[at - 1]
 
     def _phase(self, device_time_s: float) -> float:
-        begun = self._stretches[0]
+        begun = self._begun
         turns = begun.turns + (device_time_s - begun.device_s) * self._motion_hz
         return 2 * math.pi * (turns % 1.0)
 
@@ -326,6 +330,7 @@ class SimulatedCamera(Camera):
             self._stretches[-1] = begun
         else:
             self._stretches.append(begun)
+            del self._stretches[:-_REMEMBERED]
 
     # --------------------------------------------------------------------------------- limits
 
