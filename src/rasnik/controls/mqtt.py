@@ -109,7 +109,10 @@ class MqttPublisher:
             self._client.disconnect()
         except (RuntimeError, ValueError, OSError) as error:
             _log.warning("%s has not been told that the station stops: %s", self._broker, error)
-        self._client.loop_stop()
+        # It may be waiting for an answer from a network that gives none.
+        end = threading.Thread(target=self._client.loop_stop, name="mqtt end", daemon=True)
+        end.start()
+        end.join(_FAREWELL_S)
 
     # ----------------------------------------------------------------- connection
 
