@@ -231,9 +231,9 @@ def fill(path: Path, leave_bytes: int) -> None:
 
 
 def study_full_disk(
-    keep_free_mib: float, leave_bytes: int, burst: int = 1, surprise: bool = False
+    keep_free_mib: float, leave_bytes: int, rate_hz: float, surprise: bool = False
 ) -> None:
-    """Record on a disk that is filled for three seconds.
+    """Record on a disk that is filled for four seconds.
 
     With `surprise` the recorder believes that there is space, as if it had gone between the look
     at it and the writing.
@@ -248,16 +248,15 @@ def study_full_disk(
         end_s = due_s = time.monotonic()
         end_s += seconds
         while time.monotonic() < end_s:
-            for _ in range(burst):
-                sample = sample_of(number)
-                begin_s = time.perf_counter()
-                recorder.add(sample)
-                longest_s = max(longest_s, time.perf_counter() - begin_s)
-                number += 1
+            sample = sample_of(number)
+            begin_s = time.perf_counter()
+            recorder.add(sample)
+            longest_s = max(longest_s, time.perf_counter() - begin_s)
+            number += 1
             message = recorder.status().message
             if message and not (messages and messages[-1].split(":")[0] == message.split(":")[0]):
                 messages.append(message)
-            due_s += burst / RATE_HZ
+            due_s += 1 / rate_hz
             time.sleep(max(0.0, due_s - time.monotonic()))
 
     with small_disk(8) as place:
@@ -267,7 +266,7 @@ def study_full_disk(
             before = recorder.status().rows
             filler = place / "of somebody else"
             fill(filler, leave_bytes)
-            record_for(3.0)
+            record_for(4.0)
             full = recorder.status()
             filler.unlink()
             record_for(3.0)
@@ -286,7 +285,7 @@ def study_full_disk(
         assert np.array_equal(found, np.arange(number)), "rows are missing"
     print(
         f"full disk ({keep_free_mib:g} MiB kept free, {leave_bytes} bytes left"
-        f"{', space not looked at' if surprise else ''}): "
+        f"{', gone unseen' if surprise else ''}, {rate_hz:g} rows/s): "
         f"{number} rows handed over, {len(found)} found in {len(files)} files"
         f" ({len(rows) - len(found)} twice), longest call of add {longest_s * 1e3:.1f} ms, "
         f"{time.monotonic() - began_s:.0f} s"
@@ -312,10 +311,10 @@ def main() -> None:
     if not hasattr(os, "geteuid") or os.geteuid() != 0:
         print("full disk: left out, as mounting a small disk needs root")
         return
-    study_full_disk(1.5, 0)
-    study_full_disk(0.0, 1_100_000, burst=20)
-    study_full_disk(0.0, 0, surprise=True)
-    study_full_disk(0.0, 30_000, surprise=True)
+    study_full_disk(1.5, 0, RATE_HZ)
+    study_full_disk(0.0, 500_000, RATE_HZ)
+    for leave_bytes in (0, 30_000, 700_000):
+        study_full_disk(0.0, leave_bytes, 3000.0, surprise=True)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,8 @@ import os
 import time
 from pathlib import Path
 
+from rasnik.io.disk_space import reserve
+
 try:
     import fcntl
 except ImportError:  # Windows does not let two programs write a file unless both ask for it
@@ -30,6 +32,7 @@ class FileLock:
 
     def __init__(self, path: Path) -> None:
         self._descriptor = os.open(path, os.O_RDWR)
+        self._reserved = 0
         patience_s, step_s = 1.0, 0.05  # readers hold a file while they open it
         for left in range(round(patience_s / step_s), -1, -1):
             try:
@@ -52,6 +55,20 @@ class FileLock:
     def sync(self) -> None:
         """Wait until the disk has what was written to the file."""
         os.fsync(self._descriptor)
+
+    def reserve(self, end: int) -> None:
+        """Set space aside for the file up to a position, and somewhat more.
+
+        Raises
+        ------
+        OSError
+            If the disk is full.
+        """
+        if end > self._reserved:
+            step = 1 << 20
+            start = self._reserved
+            reserve(self._descriptor, start, end + step - start)
+            self._reserved = end + step
 
     def release(self) -> None:
         os.close(self._descriptor)

@@ -33,6 +33,7 @@ from rasnik.tracking.track import Track, TrackColumn
 __all__ = ["HDF5_SUFFIXES", "TrackWriter", "track_metadata"]
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
+_SPARE_BYTES = 1 << 20
 
 
 def track_metadata(system: System | None, metadata: Mapping[str, str] | None) -> dict[str, str]:
@@ -235,6 +236,8 @@ class TrackWriter:
             return
         try:
             rows = np.concatenate(self._pending)
+            # A chunk that is begun, and the index of chunks, fit into the megabyte beyond.
+            self._lock.reserve(self._file.id.get_filesize() + rows.nbytes + _SPARE_BYTES)
             for first in range(0, len(rows), MOST_ROWS):
                 append_rows(self._file[TABLE], rows[first : first + MOST_ROWS])
         except Exception as error:

@@ -78,18 +78,24 @@ def create_table(
     """A file without rows. It gets its name once it is complete: a kill leaves no half of it."""
     unfinished = path.with_name(path.name + ".new")
     columns, row = (*TRACK_COLUMNS, *extra), row_type(extra)
+    # Made in memory: should the disk be full, the library does not get to know of it.
+    with h5py.File(
+        str(unfinished), "w", driver="core", backing_store=False, libver=_LIBVER, locking=False
+    ) as file:
+        table = file.create_dataset(
+            TABLE,
+            shape=(0,),
+            maxshape=(None,),
+            dtype=row,
+            chunks=(_CHUNK_ROWS,),
+            fillvalue=np.array((-1, *(0,) * (len(columns) - 1)), dtype=row),
+        )
+        attributes = {"format": _FORMAT, "format_version": _VERSION, **metadata}
+        describe_table(table, columns, attributes)
+        file.flush()
+        content = file.id.get_file_image()
     try:
-        with h5py.File(unfinished, "w", libver=_LIBVER, locking=False) as file:
-            table = file.create_dataset(
-                TABLE,
-                shape=(0,),
-                maxshape=(None,),
-                dtype=row,
-                chunks=(_CHUNK_ROWS,),
-                fillvalue=np.array((-1, *(0,) * (len(columns) - 1)), dtype=row),
-            )
-            attributes = {"format": _FORMAT, "format_version": _VERSION, **metadata}
-            describe_table(table, columns, attributes)
+        unfinished.write_bytes(content)
         unfinished.replace(path)
     except BaseException:
         unfinished.unlink(missing_ok=True)

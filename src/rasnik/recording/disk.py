@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import re
 import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
-__all__ = ["DiskError", "free_mib", "new_name"]
+__all__ = ["DiskError", "free_mib", "new_name", "reason_of", "try_out"]
 
 
 class DiskError(Exception):
@@ -26,3 +28,27 @@ def new_name(folder: Path, channel: str, time_s: float, suffix: str) -> Path:
         number += 1
         path = folder / f"{stem}_{number}{suffix}"
     return path
+
+
+def reason_of(error: Exception) -> str:
+    """What is wrong, without what the HDF5 library tells of its buffers."""
+    text = str(error.__cause__ or error)
+    found = re.search(r"error message = '([^']+)'", text)
+    return found[1] if found else text
+
+
+def try_out(folder: Path, size: int) -> None:
+    """Write a file of some size and remove it: a disk can refuse what it says is free.
+
+    Raises
+    ------
+    OSError
+    """
+    path = folder / f".trial.{os.getpid()}"
+    try:
+        with path.open("wb") as file:
+            file.write(bytes(size))
+            file.flush()
+            os.fsync(file.fileno())
+    finally:
+        path.unlink(missing_ok=True)

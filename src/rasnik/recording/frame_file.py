@@ -28,7 +28,7 @@ from rasnik.io.file_lock import FileLock
 from rasnik.io.hdf5 import append_rows, describe_table
 from rasnik.io.hdf5_repair import clear_write_marks
 from rasnik.io.track_file import track_metadata
-from rasnik.recording.disk import free_mib, new_name
+from rasnik.recording.disk import free_mib, new_name, reason_of, try_out
 from rasnik.recording.events import Event
 from rasnik.recording.rows import RECORD_COLUMNS, RECORD_ROW, row_of
 from rasnik.recording.sample import Sample
@@ -109,6 +109,8 @@ class _FrameFile:
         """Append a frame; False if it does not fit into the file."""
         if sample.frame.image.shape != self._shape or sample.number <= self._number:
             return False
+        size = self._file.id.get_filesize() + sample.frame.image.nbytes
+        self._lock.reserve(size + _MIB)  # the row and the index of chunks fit into the rest
         # What the row refers to is on its way before the row.
         count = len(self._frames)
         self._frames.resize(count + 1, axis=0)
@@ -119,6 +121,7 @@ class _FrameFile:
         return True
 
     def close(self, later: list[str]) -> None:
+        """Close the file and give it its name."""
         try:
             also = "; ".join(dict.fromkeys(later)).encode()[:256]
             self._poses.attrs.modify("also", np.array(also, dtype="S256"))
@@ -230,6 +233,7 @@ class FrameWriter:
             self.trouble = "Raw frames are not kept: the disk is full. Make space."
             return False
         if event not in self._open:
+            try_out(self._folder, sample.frame.image.nbytes + _MIB)
             self._open[event] = _FrameFile(
                 self._folder, self._channel, event, sample.frame.image, self._metadata
             )
@@ -237,11 +241,13 @@ class FrameWriter:
         return self._open[event].write(sample)
 
     def _give_up(self, event: Event, error: Exception) -> None:
-        self.trouble = f"Raw frames could not be kept ({error}). The next event is tried again."
+        self.trouble = (
+            f"Raw frames could not be kept ({reason_of(error)}). The next event is tried again."
+        )
         self._broken.add(event)
         file = self._open.pop(event, None)
         if file is not None:
             try:
                 file.close(event.later)
-            except Exception:
-                pass  # the part that was written is completed at the next start
+            except (OSError, RuntimeError, ValueError, KeyError):
+                pass  # what was written is completed at the next start

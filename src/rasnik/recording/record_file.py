@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rasnik.instrument import System
 from rasnik.io.track_file import TrackWriter
 from rasnik.io.track_table import from_rows
-from rasnik.recording.disk import DiskError, free_mib, new_name
+from rasnik.recording.disk import DiskError, free_mib, new_name, reason_of, try_out
 from rasnik.recording.options import Recording
 from rasnik.recording.rows import RECORD_COLUMNS
 from rasnik.recording.summary import Summary, save_summary
@@ -65,7 +65,7 @@ class RecordFiles:
         self._system, self._options, self._metadata = system, options, metadata
         self._writer: TrackWriter | None = None
         self._summary = Summary()
-        self._began_s = 0.0
+        self._began_s, self._stored = 0.0, 0
         self._failures = 0
         self._again_s = 0.0
         self._trouble = ""
@@ -98,6 +98,7 @@ class RecordFiles:
             writer.write(from_rows(rows), columns)
         except (OSError, RuntimeError) as error:
             self._fail(error)
+        self._stored += len(rows)
         self._summary.extend(rows, first)
         self._failures = 0
 
@@ -117,9 +118,9 @@ class RecordFiles:
         try:
             writer.close()
         except (OSError, RuntimeError):
-            pass  # its rows were stored, or are kept and go to the next file
+            pass  # its rows were stored, or will be in the next file
         bins, self._summary = self._summary.bins(), Summary()
-        if len(bins) or writer.rows:
+        if self._stored:
             save_summary(writer.path, bins)
         else:
             writer.path.unlink(missing_ok=True)
@@ -134,6 +135,8 @@ class RecordFiles:
                 f"{least:.4g} MiB that recording needs or is to leave. Make space; it goes on by "
                 "itself."
             )
+        if self._failures or self._writer is None:
+            try_out(self.folder, size + int(_SPARE_MIB * _MIB))
 
     def _ready(self, rows: NDArray[Any]) -> TrackWriter:
         """The file for these rows, a new one if it is time for that."""
@@ -157,7 +160,7 @@ class RecordFiles:
                 flush_s=0.0,
                 extra=RECORD_COLUMNS,
             )
-            self._began_s = time.monotonic()
+            self._began_s, self._stored = time.monotonic(), 0
         return writer
 
     def _fail(self, error: Exception) -> None:
@@ -165,5 +168,7 @@ class RecordFiles:
         self.close()
         self._failures += 1
         self._again_s = time.monotonic() + min(2.0 ** (self._failures - 1), _PATIENCE_S)
-        self._trouble = f"Rows cannot be stored ({error}). The next attempt follows by itself."
+        self._trouble = (
+            f"Rows cannot be stored ({reason_of(error)}). The next attempt follows by itself."
+        )
         raise DiskError(self._trouble) from error
