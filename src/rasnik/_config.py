@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import copy
 import difflib
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -134,18 +135,20 @@ def _field_names(model: type[BaseModel], prefix: str = "") -> list[str]:
     names = []
     for name, info in model.model_fields.items():
         names.append(prefix + name)
-        if isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel):
-            names += _field_names(info.annotation, f"{prefix}{name}.")
+        for kind in (info.annotation, *get_args(info.annotation)):  # a table, or a list of them
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                names += _field_names(kind, f"{prefix}{name}.")
     return names
 
 
 def _unknown(model: type[BaseModel], dotted: str) -> str:
     """The sentence for a field that does not exist, with those that may be meant."""
-    names = _field_names(model)
+    names, wrong = _field_names(model), dotted
+    dotted = ".".join(part for part in dotted.split(".") if not part.isdigit())
     near = [name for name in names if name.rpartition(".")[2] == dotted.rpartition(".")[2]]
     near = near or difflib.get_close_matches(dotted, names, n=2, cutoff=0.7)
     hint = f"; did you mean {' or '.join(near)}?" if near else ""
-    return f"there is no field {dotted}{hint}"
+    return f"there is no field {wrong}{hint}"
 
 
 def sentences(model: type[BaseModel], error: ValidationError) -> list[str]:
@@ -164,8 +167,14 @@ def sentences(model: type[BaseModel], error: ValidationError) -> list[str]:
                 cause = fault["ctx"]["error"]
                 problems = cause.problems if isinstance(cause, ContradictionError) else [str(cause)]
                 found += [f"in {dotted}, {text}" if dotted else text for text in problems]
+            case "list_type" | "tuple_type" if isinstance(fault["input"], dict):
+                found.append(f"{dotted} is a list of tables; write [[{dotted}]] with two brackets")
+            case "list_type" | "tuple_type":
+                found.append(f"{dotted} = {fault['input']!r}: it should be a list, in brackets")
+            case "path_type":
+                found.append(f"{dotted} = {fault['input']!r}: it should be a path, in quotes")
             case _:
-                wish = fault["msg"].replace("Input should", "it should", 1)
+                wish = re.sub(r"^(Input|String|List) should", "it should", fault["msg"])
                 found.append(f"{dotted} = {fault['input']!r}: {wish}")
     return found
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rasnik._config import SystemConfigError, read_toml, sentences
 from rasnik.cameras.camera import CameraSettings
@@ -28,7 +29,16 @@ _Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,39}$")]
 
 
 class _Part(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=False)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=False, allow_inf_nan=False)
+
+
+def _in_order(limits: tuple[float, float]) -> tuple[float, float]:
+    if not limits[0] < limits[1]:
+        raise ValueError(f"the lower limit comes first, and is below the upper: {list(limits)}")
+    return limits
+
+
+_Limits = Annotated[tuple[float, float], AfterValidator(_in_order)]
 
 
 class CameraConfig(_Part):
@@ -76,18 +86,28 @@ class CameraConfig(_Part):
     def _consistent(self) -> Self:
         if self.kind == "replay" and not self.source:
             raise ValueError("a replay needs a source: folders, stacks or videos")
+        if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) < 8):
+            raise ValueError(
+                f"region = {list(self.region)} is left, top, width and height in pixels: none "
+                "below 0, width and height at least 8"
+            )
         return self
 
 
 class Alarms(_Part):
-    """Limits; beyond them a channel is in alarm. Positions count from its zero."""
+    """Limits; beyond them a channel is in alarm. Positions count from its zero.
 
-    x_um: tuple[float, float] | None = Field(default=None, description="[low, high] in um")
-    y_um: tuple[float, float] | None = Field(default=None, description="[low, high] in um")
-    scale: tuple[float, float] | None = Field(default=None, description="[low, high]")
-    theta_mrad: tuple[float, float] | None = Field(default=None, description="[low, high] in mrad")
-    chi2_ndf: tuple[float, float] | None = Field(default=None, description="[low, high]")
-    frame_rate_hz: tuple[float, float] | None = Field(default=None, description="[low, high] in Hz")
+    A limit of one side has inf or -inf at the other.
+    """
+
+    model_config = ConfigDict(allow_inf_nan=True)
+
+    x_um: _Limits | None = Field(default=None, description="[low, high] in um")
+    y_um: _Limits | None = Field(default=None, description="[low, high] in um")
+    scale: _Limits | None = Field(default=None, description="[low, high]")
+    theta_mrad: _Limits | None = Field(default=None, description="[low, high] in mrad")
+    chi2_ndf: _Limits | None = Field(default=None, description="[low, high]")
+    frame_rate_hz: _Limits | None = Field(default=None, description="[low, high] in Hz")
     lost_percent: float | None = Field(
         default=1.0, ge=0, description="of the frames of the last 10 s"
     )
@@ -164,9 +184,10 @@ class StationConfig(_Part):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         names = [channel.name for channel in self.channel]
-        twice = sorted({name for name in names if names.count(name) > 1})
+        folders = [name.lower() for name in names]  # as some file systems see them
+        twice = sorted({name for name in names if folders.count(name.lower()) > 1})
         if twice:
-            raise ValueError(f"channels need different names; twice: {', '.join(twice)}")
+            raise ValueError(f"channels need different names; not so: {', '.join(twice)}")
         return self
 
 
@@ -182,7 +203,20 @@ def load_station(path: Path) -> StationConfig:
     try:
         return _placed(StationConfig.model_validate(data), path.parent)
     except ValidationError as error:
-        raise SystemConfigError(str(path), sentences(StationConfig, error)) from None
+        problems = [_with_name(text, data) for text in sentences(StationConfig, error)]
+        raise SystemConfigError(str(path), problems) from None
+
+
+def _with_name(sentence: str, data: dict[str, Any]) -> str:
+    """A sentence about channel.0 with the name of that channel, or its place counted from 1."""
+
+    def named(found: re.Match[str]) -> str:
+        index = int(found[1])
+        channel = data["channel"][index]
+        name = channel.get("name") if isinstance(channel, dict) else None
+        return f"channel[{name if isinstance(name, str) else index + 1}]"
+
+    return re.sub(r"\bchannel\.(\d+)(?=[. ,])", named, sentence, count=1)
 
 
 def _placed(config: StationConfig, folder: Path) -> StationConfig:
