@@ -37,6 +37,9 @@ def reserve(descriptor: int, start: int, size: int) -> None:
     """
     if not sys.platform.startswith("linux"):
         return
+    disk = os.fstatvfs(descriptor)
+    if disk.f_bavail * disk.f_frsize < size:  # else a part of it would be taken and kept
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     library = ctypes.CDLL(None, use_errno=True)
     offsets = [ctypes.c_int64(value) for value in (start, size)]
     name = "fallocate64" if hasattr(library, "fallocate64") else "fallocate"

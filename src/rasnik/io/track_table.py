@@ -39,7 +39,9 @@ __all__ = [
     "TABLE",
     "TABLE_ATTRIBUTES",
     "create_table",
+    "for_appending",
     "from_rows",
+    "in_memory",
     "read_rows",
     "read_table",
     "reopened",
@@ -78,10 +80,7 @@ def create_table(
     """A file without rows. It gets its name once it is complete: a kill leaves no half of it."""
     unfinished = path.with_name(path.name + ".new")
     columns, row = (*TRACK_COLUMNS, *extra), row_type(extra)
-    # Made in memory: should the disk be full, the library does not get to know of it.
-    with h5py.File(
-        str(unfinished), "w", driver="core", backing_store=False, libver=_LIBVER, locking=False
-    ) as file:
+    with in_memory(unfinished) as file:
         table = file.create_dataset(
             TABLE,
             shape=(0,),
@@ -126,7 +125,7 @@ def reopened(
     rows = first + _whole_rows(frame)
     if rows < announced:
         _cut(path, rows)
-    return _for_appending(path), rows, int(frame[rows - 1 - first]) + 1 if rows else 0
+    return for_appending(path), rows, int(frame[rows - 1 - first]) + 1 if rows else 0
 
 
 def _cut(path: Path, rows: int) -> None:
@@ -135,7 +134,18 @@ def _cut(path: Path, rows: int) -> None:
         file[TABLE].resize((rows,))
 
 
-def _for_appending(path: Path) -> h5py.File:
+def in_memory(path: Path) -> h5py.File:
+    """A file that is in memory only: should the disk be full, the library does not get to know.
+
+    ``file.id.get_file_image()`` gives the bytes to write to the path. Two of the same path would
+    be one to the library.
+    """
+    return h5py.File(
+        str(path), "w", driver="core", backing_store=False, libver=_LIBVER, locking=False
+    )
+
+
+def for_appending(path: Path) -> h5py.File:
     """The file in SWMR mode from the first moment, so that others can read it even now."""
     access = h5py.h5p.create(h5py.h5p.FILE_ACCESS)
     access.set_libver_bounds(h5py.h5f.LIBVER_V110, h5py.h5f.LIBVER_LATEST)

@@ -32,7 +32,8 @@ def new_name(folder: Path, channel: str, time_s: float, suffix: str) -> Path:
 
 def reason_of(error: Exception) -> str:
     """What is wrong, without what the HDF5 library tells of its buffers."""
-    text = str(error.__cause__ or error)
+    cause = error.__cause__ or error
+    text = (isinstance(cause, OSError) and cause.strerror) or str(cause)
     found = re.search(r"error message = '([^']+)'", text)
     return found[1] if found else text
 

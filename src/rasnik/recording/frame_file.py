@@ -22,12 +22,14 @@ from typing import Any
 
 import h5py
 import numpy as np
+from numpy.typing import NDArray
 
 from rasnik.instrument import System
 from rasnik.io.file_lock import FileLock
 from rasnik.io.hdf5 import append_rows, describe_table
 from rasnik.io.hdf5_repair import clear_write_marks
 from rasnik.io.track_file import track_metadata
+from rasnik.io.track_table import for_appending, in_memory
 from rasnik.recording.disk import free_mib, new_name, reason_of, try_out
 from rasnik.recording.events import Event
 from rasnik.recording.rows import RECORD_COLUMNS, RECORD_ROW, row_of
@@ -74,40 +76,52 @@ def _final_name(part: Path) -> Path:
     return path
 
 
-class _FrameFile:
-    """The file of one event."""
-
-    def __init__(
-        self, folder: Path, channel: str, event: Event, image: Any, metadata: Mapping[str, str]
-    ) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        kind = re.sub(r"[^A-Za-z0-9]+", "-", event.reason.partition(":")[0]).strip("-")[:40]
-        self.path = new_name(folder, channel, event.time_s, f"_{kind or 'event'}.h5{_PART}")
-        when = datetime.fromtimestamp(event.time_s, UTC).isoformat(timespec="milliseconds")
-        self._file = h5py.File(self.path, "x", libver="v110", locking=False)
-        self._lock = FileLock(self.path)
-        self._lock.share()
-        self._frames = self._file.create_dataset(
+def _empty_file(path: Path, image: NDArray[Any], about: Mapping[str, str]) -> bytes:
+    """A file for images of this size, without any."""
+    with in_memory(path) as file:
+        file.create_dataset(
             "frames",
             (0, *image.shape),
             image.dtype,
             maxshape=(None, *image.shape),
             chunks=(1, *image.shape),
         )
-        self._poses = self._file.create_dataset(
-            "poses", (0,), RECORD_ROW, maxshape=(None,), chunks=(64,)
-        )
-        about = {"event_time_utc": when, "reason": event.reason, "channel": channel, **metadata}
-        describe_table(self._poses, (*TRACK_COLUMNS, *RECORD_COLUMNS), about)
+        poses = file.create_dataset("poses", (0,), RECORD_ROW, maxshape=(None,), chunks=(64,))
+        describe_table(poses, (*TRACK_COLUMNS, *RECORD_COLUMNS), about)
         # Attributes cannot be made longer afterwards: room for what else comes.
-        self._poses.attrs["also"] = np.array(b"", dtype="S256")
-        self._file.swmr_mode = True
-        self._shape = image.shape
+        poses.attrs["also"] = np.array(b"", dtype="S256")
+        file.flush()
+        content: bytes = file.id.get_file_image()
+    return content
+
+
+class _FrameFile:
+    """The file of one event."""
+
+    def __init__(
+        self,
+        folder: Path,
+        channel: str,
+        event: Event,
+        image: NDArray[Any],
+        metadata: Mapping[str, str],
+    ) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        kind = re.sub(r"[^A-Za-z0-9]+", "-", event.reason.partition(":")[0]).strip("-")[:40]
+        self.path = new_name(folder, channel, event.time_s, f"_{kind or 'event'}.h5{_PART}")
+        when = datetime.fromtimestamp(event.time_s, UTC).isoformat(timespec="milliseconds")
+        about = {"event_time_utc": when, "reason": event.reason, "channel": channel, **metadata}
+        with self.path.open("xb") as file:
+            file.write(_empty_file(self.path, image, about))
+        self._lock = FileLock(self.path)
+        self._lock.share()
+        self._file = for_appending(self.path)
+        self._frames, self._poses = self._file["frames"], self._file["poses"]
         self._number = -1
 
     def write(self, sample: Sample) -> bool:
         """Append a frame; False if it does not fit into the file."""
-        if sample.frame.image.shape != self._shape or sample.number <= self._number:
+        if sample.frame.image.shape != self._frames.shape[1:] or sample.number <= self._number:
             return False
         size = self._file.id.get_filesize() + sample.frame.image.nbytes
         self._lock.reserve(size + _MIB)  # the row and the index of chunks fit into the rest
