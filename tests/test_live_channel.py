@@ -13,6 +13,7 @@ from PIL import Image
 from _live_camera import (
     IMAGES,
     PERIOD_S,
+    SIZE,
     X_UM,
     Y_UM,
     ScriptedCamera,
@@ -20,7 +21,7 @@ from _live_camera import (
     make_channel,
     wait_for,
 )
-from rasnik import Flag
+from rasnik import Flag, load_system
 from rasnik.cameras.camera import (
     CameraLostError,
     CameraMissingError,
@@ -99,7 +100,7 @@ def test_from_camera_to_record(tmp_path, channels):
     assert (status.frames, status.tracked, status.dropped) == (30, 30, 0)
     assert abs(status.x_um - X_UM) < 6 * status.sigma_x_um
     assert abs(status.y_um - Y_UM) < 6 * status.sigma_y_um
-    assert status.exposure_us == 500.0  # as the camera tells: its frames do not
+    wait_for(lambda: channel.status().exposure_us == 500.0)  # the camera tells, its frames do not
     sample = channel.latest()
     assert sample is not None
     assert sample.number == 29
@@ -321,6 +322,24 @@ def test_exposure_is_set_and_recording_starts_and_stops(tmp_path, channels):
     assert recorded(tmp_path).tolist() == [1]
     channel.set_exposure(250.0)
     wait_for(lambda: channel.status().exposure_us == 250.0)
+
+
+def test_the_exposure_is_kept_just_below_full_scale(tmp_path, channels):
+    """Ten times too much light at first; the simulated camera obeys."""
+    system = load_system("solidras", SIZE)
+    nominal_us = SimulatedCamera(system, frame_rate_hz=100).settings.exposure_us
+    assert nominal_us is not None
+    camera = SimulatedCamera(system, frame_rate_hz=100, motion_um=0.1, light=10.0)
+    channel = make_channel(tmp_path, camera, recording={"enabled": False})
+    channel.keep_exposure(True)
+    run(channel, channels)
+    assert channel.keeps_exposure
+    wait_for(lambda: 0.92 * 255 < channel.status().light_level < 0.99 * 255, 30)
+    wait_for(lambda: channel.status().locked)
+    assert channel.status().exposure_us < 0.2 * nominal_us
+    channel.set_exposure(nominal_us / 20)  # by hand: it stays
+    wait_for(lambda: channel.status().exposure_us == pytest.approx(nominal_us / 20))
+    assert not channel.keeps_exposure
 
 
 def test_two_channels_of_a_station_and_one_that_is_lost(tmp_path):

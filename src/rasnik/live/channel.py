@@ -17,6 +17,7 @@ from rasnik.analysis.pose import Pose
 from rasnik.cameras.camera import Camera, CameraFrame, CameraSettings
 from rasnik.instrument import load_system
 from rasnik.live.acquisition import Acquisition, told
+from rasnik.live.light import LightKeeper
 from rasnik.live.recent import Recent
 from rasnik.live.ring import FrameRing, Waiting
 from rasnik.live.snapshot import save_snapshot
@@ -105,7 +106,7 @@ class Channel:
         self._latest_time_s = _NAN
         self._tracked = 0
         self._zero = (0.0, 0.0), 1.0, 0.0
-        self._keep_exposure = config.camera.keep_exposure
+        self._light = LightKeeper(self._acquisition, config.camera.keep_exposure)
         self._notes: dict[str, str] = {}  # what is wrong, by what it concerns
         self._stopping = threading.Event()
         self._stopped = self._started = False
@@ -141,6 +142,8 @@ class Channel:
             self._acquisition.join(max(0.0, end_s - time.monotonic()))
             self._ring.close()
             self._threads[0].join(max(0.1, end_s - time.monotonic()))
+            self._ring.abandon()  # what is not tracked by now is counted as dropped
+            self._threads[0].join(1.0)
             self._stopping.set()
             self._threads[1].join(max(0.1, end_s - time.monotonic()))
         self.recorder.close()
@@ -210,12 +213,16 @@ class Channel:
         ------
         SettingRefusedError
         """
-        self._keep_exposure = False
+        self._light.on = False
         self._acquisition.change(CameraSettings(exposure_us=us))
 
     def keep_exposure(self, on: bool) -> None:
         """Whether the exposure is kept where the brightest fields are just below full scale."""
-        self._keep_exposure = on
+        self._light.on = on
+
+    @property
+    def keeps_exposure(self) -> bool:
+        return self._light.on
 
     def zero(self) -> None:
         """Count positions from here: the mean of the last second.
@@ -366,6 +373,8 @@ class Channel:
         frame = None if sample is None else sample.frame
         for sentence in self._watch.tick(frame, self._zero[0]):
             self.recorder.event(f"alarm: {sentence}")
+        if frame is not None:
+            self._light.look(frame, self._watch.settings, self._watch.full_scale)
 
     def _state(self) -> ChannelState:
         if self._stopped:
@@ -379,7 +388,7 @@ class Channel:
 
     def _message(self) -> str:
         messages = [self._acquisition.message, *list(self._notes.values())]
-        messages += list(self._sink_errors.values())
+        messages += [self._light.message, *list(self._sink_errors.values())]
         return " ".join(message for message in messages if message)
 
     def _light_settings(self, sample: Sample | None) -> tuple[float, float]:

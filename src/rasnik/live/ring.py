@@ -12,6 +12,8 @@ from rasnik.live.losses import Arrival
 __all__ = ["FrameRing", "Waiting"]
 
 _FEWEST = 8  # frames that always find room, however large they are
+_FEW = 64  # frames that find room, however long they wait
+_LONGEST_S = 0.6  # that more may wait: what comes later is of little use
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +30,8 @@ class FrameRing:
     Parameters
     ----------
     most_bytes : int
-        Of images. When they are reached, the oldest frames make room.
+        Of images. When they are reached, or more than 64 frames wait and the oldest for 0.6 s,
+        the oldest make room.
 
     Attributes
     ----------
@@ -86,8 +89,20 @@ class FrameRing:
         with self._changed:
             return self._closed and not self._frames
 
+    def abandon(self) -> None:
+        """Drop what waits."""
+        with self._changed:
+            self.dropped += len(self._frames)
+            self._frames.clear()
+            self._bytes = 0
+
     def _is_full(self) -> bool:
-        return self._bytes >= self._most_bytes and len(self._frames) >= _FEWEST
+        count = len(self._frames)
+        if self._bytes >= self._most_bytes and count >= _FEWEST:
+            return True
+        if count < _FEW:
+            return False
+        return self._frames[-1].frame.received_s - self._frames[0].frame.received_s > _LONGEST_S
 
     def _append(self, waiting: Waiting) -> None:
         self._frames.append(waiting)

@@ -84,9 +84,7 @@ class Watch:
             self._locked_s = now_s
         self.frame_rate_hz = self._rate(now_s)
         if frame is not None:
-            bits = _BITS.get(self.settings.pixel_format or "")
-            full_scale = self._full_scale if bits is None else 2**bits - 1
-            self.saturated_fraction = float(np.mean(frame.image >= full_scale))
+            self.saturated_fraction = float(np.mean(frame.image >= self.full_scale))
         if now_s - self._asked_s >= _SELDOM_S:
             self._asked_s = now_s
             self._ask()
@@ -102,6 +100,12 @@ class Watch:
         new = self._alarm_watch.look(rows, zero_um, condition)
         self.alarms = self._alarm_watch.sentences
         return new
+
+    @property
+    def full_scale(self) -> int:
+        """Highest grey level: of the camera's pixel format, or the system's."""
+        bits = _BITS.get(self.settings.pixel_format or "")
+        return self._full_scale if bits is None else 2**bits - 1
 
     def _rate(self, now_s: float) -> float:
         """Frames in a second, from the times of the frames; 0 when they cease."""
