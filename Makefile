@@ -29,6 +29,12 @@ $(BIN)/python:
 	$(PIP) install --editable '.[dev]'
 	@touch $@ .venv/.package
 
+# Cameras: what Debian's Aravis is used through. It is compiled here, if what it needs is there.
+.venv/.camera: .venv/.dev
+	@pkg-config --exists gobject-introspection-1.0 cairo 2>/dev/null || \
+	  { echo "GigE and USB3 Vision cameras are left out: docs/cameras.md names the Debian packages"; exit 0; }; \
+	$(PIP) install --editable '.[camera]' && touch $@ || echo "PyGObject does not install; cameras are left out"
+
 # Packages to compare with; where they do not install, the benchmarks go without them and say so.
 .venv/.bench: .venv/.dev
 	$(PIP) install --editable '.[bench]' && touch $@ || echo "the packages to compare with do not install"
@@ -36,7 +42,7 @@ $(BIN)/python:
 demo: .venv/.package
 	$(BIN)/rasnik demo $(ARGS)
 
-test: .venv/.dev
+test: .venv/.dev .venv/.camera
 	$(BIN)/python -m pytest $(ARGS)
 
 lint: .venv/.dev

@@ -24,6 +24,8 @@ from rasnik.cameras.packed_pixels import grey_levels
 __all__ = ["AravisCamera", "SeenCamera", "list_cameras"]
 
 _BUFFERS = 50
+# For packets that are sent again, which are asked for after 20 ms; later frames wait, too.
+_WAIT_FOR_PACKETS_US = 40_000
 _SIXTEEN_BITS = 65535
 # A camera that is cut off is known to be lost only when the keep-alive messages of several
 # seconds have failed; frames that do not come tell earlier.
@@ -205,6 +207,8 @@ class AravisCamera(Camera):
         stream = camera.create_stream(None, None)
         if stream is None:
             raise CameraMissingError(f"{self.name} gives no stream of frames.")
+        if camera.is_gv_device():
+            stream.set_property("frame-retention", _WAIT_FOR_PACKETS_US)
         payload = camera.get_payload()
         for _ in range(_BUFFERS):
             stream.push_buffer(self._arv.Buffer.new_allocate(payload))
