@@ -51,11 +51,12 @@ class FrameRing:
         return len(self._frames)
 
     def put(self, waiting: Waiting) -> None:
-        """Append a frame; the oldest are dropped where there is no room."""
+        """Append a frame; the older half is dropped where there is no room."""
         with self._changed:
-            while self._is_full():
-                self._bytes -= self._frames.popleft().frame.image.nbytes
-                self.dropped += 1
+            if self._is_full():
+                for _ in range((len(self._frames) + 1) // 2):
+                    self._bytes -= self._frames.popleft().frame.image.nbytes
+                    self.dropped += 1
             self._append(waiting)
 
     def put_when_free(self, waiting: Waiting, timeout_s: float) -> bool:
