@@ -502,6 +502,22 @@ def test_channel_without_a_system(tmp_path: Path) -> None:
     assert finding.level == "fault" and "no-such-system" in finding.found
 
 
+def test_a_channel_without_a_system_hides_nothing_else(tmp_path: Path, quiet: None) -> None:
+    channels = [{"name": "one"}, {"name": "two", "system": "no-such-system"}]
+    values = {"folder": tmp_path, "server": {"port": 0}, "channel": channels}
+    config = StationConfig.model_validate(values)
+    findings = list(doctor.examine(config, read_token=read_token, quick=True))
+    levels = {finding.about: finding.level for finding in findings}
+    assert levels["channel one"] == "ok" and levels["channel two"] == "fault"
+    (space,) = (finding for finding in findings if finding.about == "disk space")
+    assert "of positions" in space.found
+    none = StationConfig.model_validate(values | {"channel": channels[1:]})
+    assert all(
+        "could not be looked at" not in finding.found
+        for finding in doctor.examine(none, read_token=read_token)
+    )
+
+
 def test_size_of_a_region() -> None:
     channel = station({"region": (8, 16, 320, 200), "pixel_format": "Mono12"}).channel[0]
     assert rates.system_of(channel).shape == (200, 320)

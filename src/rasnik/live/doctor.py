@@ -41,15 +41,14 @@ def examine(
         As it is found. What cannot be looked at is a finding, too.
     """
     computer = computer or Machine()
-    seen = _cameras()
+    seen, sized = _cameras(), cameras.described(config)
     checks: list[tuple[str, Callable[[], Iterable[Finding]]]] = [
         ("python", packages.python),
         ("extras", lambda: packages.extras(config)),
-        ("kernels", packages.kernels),
         ("cameras", lambda: cameras.seen(computer, seen)),
         ("channels", lambda: cameras.channels(computer, config, seen)),
         ("packet size", lambda: network.jumbo_frames(computer, config)),
-        ("socket buffers", lambda: network.receive_buffers(computer, config)),
+        ("socket buffers", lambda: network.receive_buffers(computer, sized)),
         ("reverse path", lambda: network.reverse_path_filter(computer, config)),
         ("USB memory", lambda: network.usb_memory(computer, config)),
         ("cores", lambda: machine.processors(computer, config)),
@@ -57,7 +56,7 @@ def examine(
         ("priority", lambda: machine.priority(computer)),
         ("memory lock", lambda: machine.memory_lock(computer)),
         ("clock", machine.clock),
-        ("disk space", lambda: disk.free_space(config)),
+        ("disk space", lambda: disk.free_space(sized)),
         ("file system", lambda: disk.file_system(computer, config)),
         ("port", lambda: services.port(config)),
         ("token file", lambda: services.token_file(config, read_token)),
@@ -65,8 +64,9 @@ def examine(
         ("MQTT broker", lambda: services.broker(config)),
     ]
     if not quick:
-        checks.append(("disk speed", lambda: disk.write_speed(config)))
-        checks.append(("analysis", lambda: _analysis(computer, config)))
+        checks.append(("disk speed", lambda: disk.write_speed(sized)))
+        checks.append(("analysis", lambda: _analysis(computer, sized)))
+    checks.append(("kernels", packages.kernels))  # the analysis may just have compiled them
     for about, check in checks:
         yield from guarded(about, check)
 

@@ -16,7 +16,7 @@ from rasnik.live.station import ChannelConfig, StationConfig
 if TYPE_CHECKING:
     from rasnik.cameras.aravis import SeenCamera
 
-__all__ = ["aravis_cameras", "channels", "seen", "video_devices"]
+__all__ = ["aravis_cameras", "channels", "described", "seen", "video_devices"]
 
 
 def aravis_cameras() -> list[SeenCamera]:
@@ -82,6 +82,19 @@ def channels(
             )
             continue
         yield _camera(about, machine, channel, cameras, f"{system.name}, ")
+
+
+def described(config: StationConfig) -> StationConfig:
+    """The station without channels whose system cannot be read; those are faults already."""
+
+    def readable(channel: ChannelConfig) -> bool:
+        try:
+            system_of(channel)
+        except SystemConfigError:
+            return False
+        return True
+
+    return config.model_copy(update={"channel": [c for c in config.channel if readable(c)]})
 
 
 def _camera(

@@ -81,7 +81,7 @@ def free_space(config: StationConfig) -> Iterator[Finding]:
         yield Finding("disk space", "fault", f"{found}; recording pauses below {least:.2g}", more)
         return
     if not wanted.rows_bytes_s:
-        yield Finding("disk space", "ok", f"{found}; nothing is recorded")
+        yield Finding("disk space", "ok", f"{found}; nothing is to be recorded")
         return
     days = spare / wanted.rows_bytes_s / _DAY_S
     total = wanted.rows_bytes_s + wanted.frames_bytes_s

@@ -38,7 +38,7 @@ def processors(machine: Machine, config: StationConfig) -> Iterator[Finding]:
             "cores",
             "note",
             f"{found}; {wanted} are comfortable: one for each camera, one for page and recording",
-            "See below whether the analysis keeps up; if not, use a machine with more cores.",
+            "If the analysis does not keep up (rasnik doctor without --quick), take more cores.",
         )
 
 
