@@ -2,7 +2,6 @@
 
 import re
 import socket
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -162,15 +161,15 @@ def test_a_region_that_is_refused_from_the_beginning_leaves_the_camera_free(
 
 @needs_camera
 def test_cameras_are_found_by_serial_number(fake: _fake_gige.FakeCamera) -> None:
-    seen = aravis.list_cameras()
-    assert ("T1", ADDRESS) in {(one.serial, one.address) for one in seen}
     one = aravis.AravisCamera("T1", CameraSettings(frame_rate_hz=RATE_HZ))
     one.open()
     assert one.name == "Aravis Fake T1"
     frames(one, 1)
     one.close()
     one.close()
-    with pytest.raises(CameraMissingError, match=r"camera nix does not answer; seen: .*T1"):
+    with pytest.raises(
+        CameraMissingError, match=rf"camera nix does not answer; seen: .*T1, {ADDRESS}"
+    ):
         aravis.AravisCamera("nix").open()
 
 
@@ -239,9 +238,6 @@ def test_lost_packets_are_counted_and_a_killed_camera_is_missed(
         one.open()
         frames(one, 10)
         one.close()
-    for thread in threading.enumerate():
-        if thread.name == "camera let go":
-            thread.join(15)
 
 
 @pytest.mark.parametrize(
