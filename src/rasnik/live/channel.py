@@ -154,7 +154,7 @@ class Channel:
         losses, sample = acquisition.losses, self._latest
         pose = Pose() if sample is None else sample.pose
         zero_um, zero_scale, zero_theta_rad = self._zero
-        exposure_us, gain_db = self._light_settings(sample)
+        exposure_us, gain_db = watch.light_settings(None if sample is None else sample.frame)
         return ChannelStatus(
             name=self.config.name,
             state=self._state(),
@@ -390,15 +390,3 @@ class Channel:
         messages = [self._acquisition.message, *list(self._notes.values())]
         messages += [self._light.message, *list(self._sink_errors.values())]
         return " ".join(message for message in messages if message)
-
-    def _light_settings(self, sample: Sample | None) -> tuple[float, float]:
-        """Exposure and gain of the newest frame, or as the camera told."""
-        settings = self._watch.settings
-        exposure_us, gain_db = _NAN, _NAN
-        if sample is not None:
-            exposure_us, gain_db = sample.frame.exposure_us, sample.frame.gain_db
-        if np.isnan(exposure_us) and settings.exposure_us is not None:
-            exposure_us = settings.exposure_us
-        if np.isnan(gain_db) and settings.gain_db is not None:
-            gain_db = settings.gain_db
-        return exposure_us, gain_db

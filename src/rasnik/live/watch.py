@@ -107,6 +107,16 @@ class Watch:
         bits = _BITS.get(self.settings.pixel_format or "")
         return self._full_scale if bits is None else 2**bits - 1
 
+    def light_settings(self, frame: CameraFrame | None) -> tuple[float, float]:
+        """Exposure and gain of a frame; as the camera told last, if the frame does not."""
+        told = [self.settings.exposure_us, self.settings.gain_db]
+        exposure_us, gain_db = (_NAN if value is None else value for value in told)
+        if frame is not None and np.isfinite(frame.exposure_us):
+            exposure_us = frame.exposure_us
+        if frame is not None and np.isfinite(frame.gain_db):
+            gain_db = frame.gain_db
+        return exposure_us, gain_db
+
     def _rate(self, now_s: float) -> float:
         """Frames in a second, from the times of the frames; 0 when they cease."""
         last_s, frames = self._acquisition.last_frame_s, self._acquisition.losses.frames
