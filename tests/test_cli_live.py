@@ -133,7 +133,7 @@ def test_init_writes_a_station_and_overwrites_none(tmp_path):
     ("text", "message"),
     [
         ("channel = 3", "channel = 3"),
-        (CHANNEL + "camra = 1", "there is no field channel.0.camra"),
+        (CHANNEL + "camra = 1", "there is no field channel[one].camra"),
         (CHANNEL + "[channel.camera]\nkind = 'replay'", "a replay needs a source"),
         (CHANNEL.replace("small", "other"), "other.toml"),
     ],

@@ -31,7 +31,7 @@ class FrameRing:
     ----------
     most_bytes : int
         Of images. When they are reached, or more than 64 frames wait and the oldest for 0.6 s,
-        the oldest make room.
+        the older half makes room.
 
     Attributes
     ----------
