@@ -120,8 +120,8 @@ class EpicsServer:
             except Exception as error:  # nothing of this may reach the station
                 if self._stopping.is_set():
                     break
-                said = "; ".join(self._said)
-                self.message = f"The EPICS server has ended and is started again ({error}) {said}"
+                why = "; ".join([str(error), *self._said])
+                self.message = f"The EPICS server has ended and is started again: {why}"
                 _log.warning(self.message)
             self._ready.clear()
             wait_s = 1.0 if time.monotonic() - began > _SETTLED_S else wait_s
