@@ -1,4 +1,4 @@
-"""A station without cameras for tests of the page: known frames, known poses, a record in memory."""
+"""A station without cameras for tests of the page: known frames, known poses."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ class FakeChannel:
         x, y, scale, theta = np.array([4000, 5000, 1, 0.002]) + noise
         x += 0.05 * np.sin(2 * np.pi * k / self.rate_hz)
         pose = Pose(
-            ok=True, x_um=x, y_um=y, scale=scale, theta_rad=theta, orientation=1, chi2_ndf=1.0,
+            ok=True, x_um=x, y_um=y, scale=scale, theta_rad=theta, orientation=4, chi2_ndf=1.0,
             covariance=np.diag(np.square(SIGMAS)), dark_level=20.0, light_level=200.0,
-            projection=Projection.from_pose(x, y, scale, theta, 1), method="likelihood",
+            projection=Projection.from_pose(x, y, scale, theta, 4), method="likelihood",
         )  # fmt: skip
         frame = CameraFrame(self._image, k + 1, now, time.perf_counter(), now, self._exposure_us)
         self._latest = Sample(frame, k, pose)

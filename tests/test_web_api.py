@@ -338,7 +338,7 @@ def test_the_lattice_lies_on_the_edges_of_the_fields(station: Any) -> None:
     sample = station.channels["top"].latest()
     system = station.channels["top"].system
     x, y, scale, theta = 4000.0, 5000.0, 1.0, 0.002  # of the image
-    pose = Pose(ok=True, projection=Projection.from_pose(x, y, scale, theta, 1))
+    pose = Pose(ok=True, projection=Projection.from_pose(x, y, scale, theta, 4))
     lines, code = lattice(pose, system, sample.frame.image.shape)
     field_px = system.pixels_per_field
     image = sample.frame.image.astype(float)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import rasnik
 from rasnik.cameras.camera import CameraError
 from rasnik.web.picture import encoded
-from rasnik.web.quantities import QUANTITIES, finite, status_dict
+from rasnik.web.quantities import QUANTITIES, channel_dict, finite
 
 if TYPE_CHECKING:
     from rasnik.live.channel import Channel
@@ -106,11 +106,11 @@ def _health(station: Station, _: None, values: dict[str, Any]) -> Any:
 
 
 def _channels(station: Station, _: None, values: dict[str, Any]) -> Any:
-    return [status_dict(channel.status()) for channel in station.channels.values()]
+    return [channel_dict(channel) for channel in station.channels.values()]
 
 
 def _channel(station: Station, channel: Channel, values: dict[str, Any]) -> Any:
-    return status_dict(channel.status())
+    return channel_dict(channel)
 
 
 def columns(rows: NDArray[Any]) -> dict[str, list[Any]]:
@@ -184,7 +184,7 @@ def _metrics(station: Station, _: None, values: dict[str, Any]) -> Any:
 
 
 def _done(channel: Channel) -> Any:
-    return status_dict(channel.status())
+    return channel_dict(channel)
 
 
 def _start_recording(station: Station, channel: Channel, values: dict[str, Any]) -> Any:
@@ -346,7 +346,7 @@ def answer(endpoint: Endpoint, station: Station, name: str | None, given: dict[s
     values = parameters_of(endpoint, given)
     try:
         return endpoint.answer(station, channel, values)
-    except CameraError as error:
+    except (CameraError, ValueError) as error:
         raise ApiError(409, str(error)) from None
     except OSError as error:
         raise ApiError(507, f"The disk does not take it: {error.strerror or error}.") from None

@@ -21,7 +21,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from rasnik.web.packets import pack
 from rasnik.web.picture import Pictures
-from rasnik.web.quantities import QUANTITIES, finite, status_dict
+from rasnik.web.quantities import QUANTITIES, channel_dict, finite
 from rasnik.web.rows import last_rows
 from rasnik.web.spectra import Spectra
 
@@ -191,7 +191,7 @@ class _Client:
         await self._socket.send_bytes(message)
 
     def _status(self) -> bytes:
-        channels = [status_dict(c.status()) for c in self._feeds.station.channels.values()]
+        channels = [channel_dict(c) for c in self._feeds.station.channels.values()]
         return pack({"kind": "status", "host_time_s": time.time(), "channels": channels})
 
     async def _rows(self, channel: Channel, wishes: _Wishes, after: int) -> int:

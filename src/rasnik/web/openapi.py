@@ -148,6 +148,7 @@ def _channel() -> dict[str, Any]:
     hints = typing.get_type_hints(ChannelStatus)
     fields = {f.name: _schema_of(hints[f.name]) for f in dataclasses.fields(ChannelStatus)}
     keys = [key for q in QUANTITIES for key in (q.key, f"sigma_{q.key}")]
+    fields["keep_exposure"] = {"type": ["boolean", "null"], "description": "null: not told"}
     return _object(**fields, relative=_object(**{key: _NUMBER for key in keys}))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from rasnik.live.status import ChannelStatus
 
-__all__ = ["QUANTITIES", "Quantity", "finite", "relative", "status_dict"]
+__all__ = ["QUANTITIES", "Quantity", "channel_dict", "finite", "relative"]
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,13 @@ def finite(value: Any) -> Any:
     return value
 
 
-def status_dict(status: ChannelStatus) -> dict[str, Any]:
-    """A status as JSON, with the position from the zero beside that from the mask's origin."""
+def channel_dict(channel: Any) -> dict[str, Any]:
+    """A channel's status as JSON, with the position from the zero beside that from the origin.
+
+    `keep_exposure` is null where the channel does not tell whether it keeps its exposure.
+    """
+    status = channel.status()
     content = dataclasses.asdict(status)
     content["relative"] = relative(status)
+    content["keep_exposure"] = getattr(channel, "keeps_exposure", None)
     return dict(finite(content))

@@ -137,7 +137,7 @@ export class Curves {
     title.textContent = `${quantity.name} / ${quantity.unit}`;
     box.append(title);
     this.place.append(box);
-    const line = { stroke: colour, width: 1.25, points: { show: false } };
+    const line = { stroke: colour, width: 1, points: { show: false } };
     const edge = { stroke: "transparent", width: 0, points: { show: false }, show: false };
     return new uPlot({
       width: this.place.clientWidth || 600,

@@ -138,4 +138,5 @@ by("keep").onchange = async () => {
   if (await act("keep-exposure", { on })) tell(on ? "The exposure is kept at the working point." : "The exposure stays as it is.");
 };
 
+if (chosen) wish();
 ask("/api/station").then((station) => { if (station) by("station").textContent = station.name; });

@@ -144,6 +144,6 @@ export class Panel {
     if (document.activeElement !== exposure && !exposure.dataset.changed && channel.exposure_us !== null) {
       exposure.value = String(Number(channel.exposure_us.toPrecision(5)));
     }
-    if ("keep_exposure" in channel) document.getElementById("keep").checked = channel.keep_exposure;
+    if (channel.keep_exposure !== null) document.getElementById("keep").checked = channel.keep_exposure;
   }
 }
