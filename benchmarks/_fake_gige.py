@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import ctypes
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -25,6 +26,7 @@ import numpy as np
 
 CENTRE_UM = (41000.0, 30200.0)
 THETA_RAD, ORIENTATION = 0.002, 4
+PORT = 3956  # of GigE Vision
 NOMINAL_EXPOSURE_US = 1000.0
 SENT = np.dtype([("time_us", "<i8"), ("number", "<u4"), ("phase", "<u4")])
 _MOST_SENT = 1 << 20  # frames noted: an hour at 275 Hz
@@ -124,8 +126,6 @@ def make_pictures(path: Path, pool: int, radius_um: float, system: Any, seed: in
 
 def add_address(address: str) -> str:
     """Give the loopback interface another address; a sentence if that is not possible."""
-    import socket
-
     if address == "127.0.0.1":
         return ""
     try:
@@ -150,6 +150,11 @@ class _Camera:
         gi.require_version("Aravis", "0.8")
         from gi.repository import Aravis
 
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.bind((options.address, PORT))  # Aravis would share it with another camera
+            except OSError as error:
+                raise SystemExit(f"no camera is possible at {options.address}: {error}") from None
         self._pictures = np.load(options.pictures)
         self._levels = np.arange(256)
         self._light = options.light
@@ -158,7 +163,7 @@ class _Camera:
         self._count = 0
         self._camera = Aravis.GvFakeCamera.new_full(options.address, options.serial, None)
         if not self._camera.is_running():
-            raise SystemExit(f"there is no camera possible at {options.address}")
+            raise SystemExit(f"no camera is possible at {options.address}")
         self._camera.set_property("gvsp-lost-ratio", options.lost_ratio)
         self._fake = self._camera.get_fake_camera()
         _, height, width = self._pictures.shape

@@ -19,6 +19,7 @@ from rasnik.cameras.camera import (
     CameraSettings,
     SettingRefusedError,
 )
+from rasnik.cameras.exposure import ExposureKeeper
 from rasnik.cameras.packed_pixels import grey_levels
 
 SYSTEM = load_system("solidras", {"sensor.width_px": 240, "sensor.height_px": 180})
@@ -35,7 +36,7 @@ def why_not() -> str:
         return str(error)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            probe.bind((ADDRESS, 3956))  # the port of GigE Vision
+            probe.bind((ADDRESS, _fake_gige.PORT))
         except OSError:
             return "another camera answers at this computer's own address"
     return ""
@@ -54,7 +55,9 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fake(pictures: Path) -> Iterator[_fake_gige.FakeCamera]:
-    with _fake_gige.FakeCamera(pictures.with_name("sent.bin"), pictures, serial="T1") as camera:
+    with _fake_gige.FakeCamera(
+        pictures.with_name("sent.bin"), pictures, address=ADDRESS, serial="T1"
+    ) as camera:
         yield camera
 
 
@@ -111,6 +114,21 @@ def test_settings_are_told_and_come_into_force(camera: aravis.AravisCamera) -> N
     dim = frames(camera, 20)[-1]
     assert dim.exposure_us == 500.0
     assert dim.image.mean() == pytest.approx(bright / 2, rel=0.02)
+
+
+@needs_camera
+@pytest.mark.parametrize("exposure_us", [150.0, 3000.0])
+def test_exposure_is_kept_below_full_scale(camera: aravis.AravisCamera, exposure_us: float) -> None:
+    keeper = ExposureKeeper(255, longest_us=1e6 / RATE_HZ)
+    camera.change(CameraSettings(exposure_us=exposure_us))
+    for _ in range(80):
+        proposed_us = keeper.propose(frames(camera, 1)[0])
+        if proposed_us is not None:
+            camera.change(CameraSettings(exposure_us=proposed_us))
+    settled = frames(camera, 5)[-1].image
+    assert 0.92 * 255 <= np.quantile(settled, 0.999) <= 0.99 * 255
+    assert np.mean(settled == 255) < 2e-3
+    assert 900.0 < camera.settings.exposure_us < 1000.0  # the pictures' own is 1000 us
 
 
 @needs_camera
@@ -187,7 +205,7 @@ def test_without_a_trigger_no_frame_comes_and_nothing_is_lost(
 ) -> None:
     one = aravis.AravisCamera(ADDRESS, CameraSettings(trigger="Software"))
     one.open()
-    assert [one.read(0.3) for _ in range(8)] == [None] * 8
+    assert [one.read(0.3) for _ in range(5)] == [None] * 5
     one.change(CameraSettings(trigger="free", frame_rate_hz=RATE_HZ))
     frames(one, 2)
     one.close()
@@ -203,7 +221,7 @@ def test_lost_packets_are_counted_and_a_killed_camera_is_missed(
     fake.close()
     log = pictures.with_name("lossy.bin")
     settings = CameraSettings(frame_rate_hz=RATE_HZ, packet_bytes=2000)
-    with _fake_gige.FakeCamera(log, pictures, lost_ratio=0.02) as lossy:
+    with _fake_gige.FakeCamera(log, pictures, address=ADDRESS, lost_ratio=0.02) as lossy:
         one = aravis.AravisCamera(ADDRESS, settings)
         one.open()
         until_s = time.perf_counter() + 2.0
@@ -234,7 +252,7 @@ def test_lost_packets_are_counted_and_a_killed_camera_is_missed(
         one.close()
         assert time.perf_counter() - closing_s < 0.5
         assert one.counters()["missing_packets"] >= counters["missing_packets"]
-    with _fake_gige.FakeCamera(log, pictures):
+    with _fake_gige.FakeCamera(log, pictures, address=ADDRESS):
         one.open()
         frames(one, 10)
         one.close()
