@@ -103,7 +103,6 @@ class Channel:
         self._sinks: list[Sink] = [self.recorder]
         self._sink_errors: dict[int, str] = {}
         self._latest: Sample | None = None
-        self._latest_time_s = _NAN
         self._tracked = 0
         self._zero = (0.0, 0.0), 1.0, 0.0
         self._light = LightKeeper(self._acquisition, config.camera.keep_exposure)
@@ -162,7 +161,7 @@ class Channel:
             camera=self._camera.name,
             metrology=self._camera.metrology,
             locked=pose.ok and self._state() == "running",
-            time_s=self._latest_time_s,
+            time_s=_NAN if sample is None else sample.frame.host_time_s,
             x_um=pose.x_um,
             y_um=pose.y_um,
             scale=pose.scale,
@@ -320,7 +319,6 @@ class Channel:
         if arrival.flags:
             pose = replace(pose, flags=pose.flags | arrival.flags)
         sample = Sample(frame, arrival.number, pose)
-        self._latest_time_s = frame.host_time_s
         self._latest = sample
         self._tracked += pose.ok
         self.recent.add(sample, frame.host_time_s, time.perf_counter() - frame.received_s)

@@ -53,7 +53,7 @@ class CameraConfig(_Part):
     source: list[str] = Field(default=[], description="replay: folders, stacks, videos")
     pace: Literal["original", "full"] = Field(default="original", description="replay")
     repeat: bool = Field(default=False, description="replay: from the beginning again at its end")
-    motion_um: float = Field(default=2.0, ge=0, description="simulated: amplitude of the motion")
+    motion_um: float = Field(default=0.5, ge=0, description="simulated: amplitude of the motion")
     motion_hz: float = Field(default=0.3, gt=0, description="simulated: its frequency")
     seed: int = Field(default=0, ge=0, description="simulated")
     frame_rate_hz: float | None = Field(
