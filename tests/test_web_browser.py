@@ -171,8 +171,10 @@ def test_a_snapshot_and_the_exposure(page: Any, station: Station) -> None:
     page.locator("#exposure").fill("1500")
     page.get_by_role("button", name="Set").click()
     page.get_by_text("Exposure set to 1500").wait_for(timeout=WAIT_MS)
-    page.wait_for_timeout(500)
-    assert station.channels["top"].status().exposure_us == pytest.approx(1500, rel=0.01)
+    end = time.monotonic() + WAIT_MS / 1000
+    while station.channels["top"].status().exposure_us != pytest.approx(1500, rel=0.01):
+        assert time.monotonic() < end, "frames with the new exposure do not come"
+        page.wait_for_timeout(100)
 
 
 def test_an_alarm_shows_in_words_and_colour(page: Any) -> None:
