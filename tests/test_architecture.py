@@ -15,7 +15,8 @@ import rasnik
 PACKAGE = Path(rasnik.__file__).parent
 
 # What is printed, what the instrument is, what the image must look like, where it is, how well;
-# then files, cameras and screens. Nothing imports from a room to its right, not even inside a function.
+# then files, cameras and screens. Nothing imports from a room to its right, not even inside a
+# function.
 ROOMS = (
     "_config",
     "mask",
