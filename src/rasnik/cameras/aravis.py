@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import threading
 import time
 from contextlib import suppress
@@ -10,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from rasnik.cameras import aravis_settings
+from rasnik.cameras.addresses import is_address
 from rasnik.cameras.camera import (
     NAN,
     Camera,
@@ -177,7 +177,7 @@ class AravisCamera(Camera):
     def _connected(self) -> Any:
         """The camera of that name, under our control."""
         name = self._device_name
-        if not _is_address(name):
+        if not is_address(name):
             seen = list_cameras()
             chosen = [one for one in seen if not name or name in _names(one)]
             if not chosen:
@@ -372,14 +372,6 @@ def _largest_number(camera: Any) -> int | None:
     if camera.is_feature_available(extended) and camera.get_string(extended) == "On":
         return None
     return _SIXTEEN_BITS
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 def _names(camera: SeenCamera) -> set[str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import socket
 import stat
@@ -11,6 +10,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
+from rasnik.cameras.addresses import is_loopback
 from rasnik.live.station import Server
 
 if TYPE_CHECKING:
@@ -169,13 +169,3 @@ class PageServer:
                 "Choose another with --port; 0 takes any that is free."
             ) from None
         return listener
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address is seen by this machine alone."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rasnik._config import SystemConfigError
+from rasnik.cameras.addresses import is_address
 from rasnik.cameras.camera import CameraError
 from rasnik.live.checks.finding import Finding, Machine
 from rasnik.live.checks.rates import system_of
-from rasnik.live.checks.services import is_address
 from rasnik.live.station import ChannelConfig, StationConfig
 
 if TYPE_CHECKING:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import errno
-import ipaddress
 import os
 import socket
 import stat
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from rasnik.cameras.addresses import is_loopback
 from rasnik.live.checks.finding import Finding
 from rasnik.live.station import StationConfig
 
-__all__ = ["broker", "is_address", "is_loopback", "password_file", "port", "token_file"]
+__all__ = ["broker", "password_file", "port", "token_file"]
 
 _BROKER_S = 3.0
 
@@ -66,22 +66,6 @@ def _refused(error: OSError, where: str) -> tuple[str, str]:
             "Set host in [server] to 127.0.0.1, or to an address of this machine.",
         )
     return f"{where} cannot be used: {error.strerror or error}", "Choose another port."
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches an address."""
-    if not is_address(host):
-        return host == "localhost"
-    return ipaddress.ip_address(host).is_loopback
-
-
-def is_address(host: str) -> bool:
-    """Whether it is a numeric address, not a name."""
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
 
 
 def token_file(config: StationConfig, read_token: Callable[[Path], object]) -> Iterator[Finding]:
