@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import select
 import shutil
 import subprocess
 import sys
@@ -31,6 +30,7 @@ from pathlib import Path
 
 import numpy as np
 
+from _kill import killed
 from rasnik import load_system
 from rasnik.analysis.pose import Pose
 from rasnik.cameras.camera import CameraFrame
@@ -128,23 +128,7 @@ def kill_once(folder: Path, run: int, after_s: float) -> Kill:
     """
     before = set(record_files(folder / CHANNEL))
     command = [sys.executable, __file__, "--record", str(folder), str(run * RUN)]
-    child = subprocess.Popen(command, stdout=subprocess.PIPE)
-    assert child.stdout is not None
-    told, kill_s = b"", float("inf")
-    while time.monotonic() < kill_s:
-        wait_s = min(kill_s - time.monotonic(), 60.0)
-        if select.select([child.stdout], [], [], max(0.0, wait_s))[0]:
-            news = os.read(child.stdout.fileno(), 65536)
-            assert news, "the program ended by itself"
-            if not told:
-                kill_s = time.monotonic() + after_s
-            told += news
-    child.kill()
-    kill_s = time.monotonic()
-    told += child.stdout.read()
-    child.wait()
-    child.stdout.close()
-    lines = np.array([line.split() for line in told.decode().splitlines()], dtype=float)
+    lines, kill_s = killed(command, after_s)
     next_number, at_s = lines[:, 0].astype(int), lines[:, 1]
 
     files = [path for path in record_files(folder / CHANNEL) if path not in before]

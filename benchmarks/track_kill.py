@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import select
-import subprocess
 import sys
 import tempfile
 import time
@@ -23,6 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
+from _kill import killed
 from rasnik import Track, load_system
 from rasnik.io import TrackWriter, read_track
 from rasnik.tracking.track import TRACK_COLUMNS
@@ -77,24 +76,7 @@ def kill_once(path: Path, after_s: float, flush_s: float) -> Kill:
         If the file does not hold what it must.
     """
     command = [sys.executable, __file__, "--write", str(path), str(flush_s)]
-    child = subprocess.Popen(command, stdout=subprocess.PIPE)
-    assert child.stdout is not None
-    told = b""
-    kill_s = float("inf")
-    while time.monotonic() < kill_s:
-        wait_s = min(kill_s - time.monotonic(), 60.0)
-        if select.select([child.stdout], [], [], max(0.0, wait_s))[0]:
-            news = os.read(child.stdout.fileno(), 65536)
-            assert news, "the writer ended by itself"
-            if not told:
-                kill_s = time.monotonic() + after_s
-            told += news
-    child.kill()
-    kill_s = time.monotonic()
-    told += child.stdout.read()
-    child.wait()
-    child.stdout.close()
-    lines = np.array([line.split() for line in told.decode().splitlines()], dtype=float)
+    lines, kill_s = killed(command, after_s)
     stop, at_s = lines[:, 0].astype(int), lines[:, 1]
 
     track = read_track(path)

@@ -12,6 +12,7 @@ import typer
 from rasnik.cli.analyse import check_instrument, parse_bounds
 from rasnik.cli.common import fail, load, messages, output
 from rasnik.cli.files import check_outputs, save_json, stored_track, system_for, written
+from rasnik.cli.predict import SetOption
 
 if TYPE_CHECKING:
     from rasnik.characterisation.edges import Edges
@@ -52,10 +53,7 @@ def edges_command(
             help="System by name (see rasnik systems) or TOML file.",
         ),
     ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="K=V", help="Change a value of the system; repeatable."),
-    ] = None,
+    overrides: SetOption = None,
     field_um: Annotated[
         float | None,
         typer.Option(

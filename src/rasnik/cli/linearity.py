@@ -19,6 +19,7 @@ from rasnik.cli.files import (
     system_for,
     written,
 )
+from rasnik.cli.predict import SetOption
 
 if TYPE_CHECKING:
     from rasnik.characterisation.folding import Folding
@@ -43,10 +44,7 @@ def linearity_command(
             show_default=False,
         ),
     ],
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="K=V", help="Change a value of the system; repeatable."),
-    ] = None,
+    overrides: SetOption = None,
     theta: Annotated[
         str | None,
         typer.Option(

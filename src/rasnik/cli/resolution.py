@@ -12,6 +12,7 @@ import typer
 from rasnik.cli.analyse import Method
 from rasnik.cli.common import fail, load, messages, output
 from rasnik.cli.files import check_outputs, save_json, stored_track, system_for, written
+from rasnik.cli.predict import SetOption
 
 if TYPE_CHECKING:
     from rasnik.characterisation.resolution import Resolution
@@ -42,10 +43,7 @@ def resolution_command(
             help="System by name or TOML file; by default that of the track.",
         ),
     ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="K=V", help="Change a value of the system; repeatable."),
-    ] = None,
+    overrides: SetOption = None,
     method: Annotated[
         Method | None,
         typer.Option(help="Analyse images one by one in this way; by default they are tracked."),

@@ -11,6 +11,7 @@ import typer
 
 from rasnik.cli.common import fail, load, messages, numbers, output
 from rasnik.cli.files import check_outputs, read_stored, system_for, written
+from rasnik.cli.predict import SetOption
 
 if TYPE_CHECKING:
     from rasnik.characterisation.spectrum import Coherence
@@ -70,10 +71,7 @@ def spectrum_command(
             help="For the bound; by default the system stored with each track.",
         ),
     ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="K=V", help="Change a value of the system; repeatable."),
-    ] = None,
+    overrides: SetOption = None,
     output_files: Annotated[
         list[Path] | None,
         typer.Option(
