@@ -26,7 +26,9 @@ ROOMS = (
     "analysis",
     "tracking",
     "performance",
+    "geometry",
     "characterisation",
+    "seismic",
     "io",
     "cameras",
     "recording",
@@ -34,6 +36,7 @@ ROOMS = (
     "controls",
     "web",
     "report",
+    "archive",
     "paper",
     "cli",
 )

@@ -1,0 +1,1 @@
+"""Images of many instruments, analysed by many workers into one data set."""
