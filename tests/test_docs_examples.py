@@ -1,0 +1,86 @@
+"""What stands in code blocks of the pages is run, page by page, each in a folder of its own.
+
+Blocks marked ``python`` and ``bash`` are run in their order; python blocks of a page share their
+names. A block marked ``output`` holds what the block before it prints (``...`` for what differs
+from machine to machine, space is not compared). Blocks with other marks are only read.
+"""
+
+import contextlib
+import doctest
+import io
+import os
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+BLOCK = re.compile(r"^```(python|bash|output)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+LOOSE = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
+
+
+@dataclass(frozen=True)
+class Block:
+    kind: str
+    text: str
+    line: int
+
+
+def blocks(page: Path) -> list[Block]:
+    text = page.read_text(encoding="utf-8")
+    return [
+        Block(found[1], found[2], text.count("\n", 0, found.start()) + 2)
+        for found in BLOCK.finditer(text)
+    ]
+
+
+def run_python(block: Block, page: Path, names: dict[str, object]) -> str:
+    said = io.StringIO()
+    code = compile("\n" * (block.line - 1) + block.text, str(page), "exec")
+    with contextlib.redirect_stdout(said):
+        exec(code, names)
+    return said.getvalue()
+
+
+def run_bash(block: Block, page: Path) -> str:
+    programs = Path(sys.executable).parent
+    environment = os.environ | {
+        "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}",
+        "COLUMNS": "160",
+        "MPLBACKEND": "agg",
+    }
+    run = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", block.text],
+        capture_output=True,
+        text=True,
+        env=environment,
+        timeout=120,
+    )
+    assert run.returncode == 0, f"{page.name}, line {block.line}: {run.stdout}{run.stderr}"
+    return run.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "page", [page for page in PAGES if blocks(page)], ids=lambda page: page.stem
+)
+def test_examples_of_a_page_run(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    names: dict[str, object] = {"__name__": "__main__"}
+    said = ""
+    for block in blocks(page):
+        if block.kind == "python":
+            said = run_python(block, page, names)
+        elif block.kind == "bash":
+            said = run_bash(block, page)
+        else:
+            checker = doctest.OutputChecker()
+            if not checker.check_output(block.text, said, LOOSE):
+                pytest.fail(f"{page.name}, line {block.line}: what was said is\n{said}")
