@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rasnik.io.folders import is_url, is_zarr_folder
+
 __all__ = [
     "IMAGE_SUFFIXES",
     "STACK_SUFFIXES",
@@ -66,12 +68,15 @@ class Stack:
     counted : bool
         False: `count` is what the file promises, and `read` raises `EndOfStack` after the last
         frame that is there.
+    time_s : callable, optional
+        ``time_s(index)`` gives when a frame was taken, since 1970 UTC; NaN if not known.
     """
 
     count: int
     read: Callable[[int], tuple[Image, tuple[str, ...]]]
     error: str | None = None
     counted: bool = True
+    time_s: Callable[[int], float] | None = None
 
 
 def to_grey(colours: Image) -> Image:
@@ -249,7 +254,7 @@ def _open_pnm(path: Path) -> Iterator[Stack]:
 # ------------------------------------------------------------------------ NumPy, HDF5
 
 
-def _frames_of(array: Any, what: str) -> Stack:
+def frames_of_array(array: Any, what: str) -> Stack:
     """Stack from an array-like of shape (height, width), (n, height, width) or with channels."""
     shape, dtype = tuple(array.shape), np.dtype(array.dtype)
     if dtype.kind not in "buif":
@@ -284,7 +289,7 @@ def _open_npy(path: Path) -> Iterator[Stack]:
         raise ImageFileError(
             f"the array cannot be read ({error}); store grey levels as integers or floats"
         ) from error
-    yield _frames_of(array, "the array")
+    yield frames_of_array(array, "the array")
 
 
 def _hdf5_candidates(file: Any) -> list[str]:
@@ -326,7 +331,7 @@ def _open_hdf5(path: Path, dataset: str | None) -> Iterator[Stack]:
                 f"there is no dataset {dataset} in the HDF5 file; "
                 f"it holds {', '.join(names) if names else 'no images'}"
             )
-        yield _frames_of(item, f"dataset {dataset}")
+        yield frames_of_array(item, f"dataset {dataset}")
 
 
 # ------------------------------------------------------------------------ which decoder
@@ -369,14 +374,16 @@ def _is_video(head: bytes, suffix: str) -> bool:
     return avi or known or suffix in VIDEO_SUFFIXES
 
 
-def open_stack(path: Path, dataset: str | None = None) -> AbstractContextManager[Stack]:
-    """Open an image file.
+def open_stack(path: Path | str, dataset: str | None = None) -> AbstractContextManager[Stack]:
+    """Open an image file, or a Zarr store.
 
     Parameters
     ----------
-    path : Path
+    path : Path or str
+        On this machine, or a URL.
     dataset : str, optional
-        Dataset of an HDF5 file, needed if it holds more than one that can be images.
+        Dataset of an HDF5 file or array of a Zarr store, needed if it holds more than one that
+        can be images.
 
     Returns
     -------
@@ -388,8 +395,17 @@ def open_stack(path: Path, dataset: str | None = None) -> AbstractContextManager
         If the file is missing, empty, or of no format known here; and, when it is entered or
         read, if it is truncated, damaged or has the wrong dimensions.
     """
+    if isinstance(path, str) and is_url(path):
+        from rasnik.io.remote import open_remote
+
+        return open_remote(path, dataset)
+    path = Path(path)
     if not path.exists():
         raise ImageFileError("no such file; check the name and the folder")
+    if path.is_dir() and (is_zarr_folder(path) or path.suffix.lower() == ".zarr"):
+        from rasnik.io.zarr_stack import open_zarr
+
+        return open_zarr(str(path), dataset)
     if not path.is_file():
         raise ImageFileError("this is not a file; name image files, or a folder of them")
     with path.open("rb") as file:

@@ -7,6 +7,7 @@ others still come out.
 from __future__ import annotations
 
 import glob
+import math
 import os
 import re
 from collections.abc import Generator, Iterable, Iterator
@@ -18,16 +19,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rasnik.io.folders import is_url, is_zarr_folder, natural_key
 from rasnik.io.formats import (
     IMAGE_SUFFIXES,
     VIDEO_SUFFIXES,
     EndOfStack,
     ImageFileError,
+    Stack,
     open_stack,
 )
 from rasnik.io.lwdaq import lwdaq_bounds
 
-__all__ = ["Frame", "Source", "count_frames", "expand_paths", "iter_frames"]
+__all__ = ["Frame", "Source", "count_frames", "expand_paths", "iter_frames", "split_dataset"]
 
 Bounds = tuple[int, int, int, int]
 PathLike = str | os.PathLike[str]
@@ -54,6 +57,10 @@ class Frame:
         Rows at the top that are not picture but data (1 for LWDAQ images).
     notes : tuple of str
         What was done to the image on reading it.
+    time_s : float
+        When it was taken, since 1970 UTC, if the file says it; NaN if not.
+    time_source : str
+        Where the time is from: "metadata" of the file, or what the reader of an archive found.
     """
 
     file: str
@@ -63,6 +70,8 @@ class Frame:
     bounds_px: Bounds | None = None
     header_rows: int = 0
     notes: tuple[str, ...] = ()
+    time_s: float = math.nan
+    time_source: str = ""
 
     def clip_bounds(self, bounds_px: Bounds | None) -> Bounds | None:
         """The given bounds, without header rows; by default the frame's own bounds.
@@ -92,31 +101,32 @@ class Frame:
 
 @dataclass(frozen=True)
 class Source:
-    """One file to read, or the reason why there is none."""
+    """One file to read, or the reason why there is none.
+
+    What does not lie on this machine has a `url`, and its path does not exist.
+    """
 
     name: str
     path: Path
     dataset: str | None = None
     error: str | None = None
+    url: str | None = None
 
 
-def _natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """Sort key with numbers by value: frame2 before frame10."""
-    parts = re.split(r"(\d+)", path.name.lower())
-    return [(0, int(p), "") if p.isdigit() else (1, 0, p) for p in parts]
-
-
-def _split_dataset(name: str) -> tuple[str, str | None]:
-    match = re.fullmatch(r"(.*\.(?:h5|hdf5)):(/.*)", name, re.IGNORECASE)
+def split_dataset(name: str) -> tuple[str, str | None]:
+    """File and dataset of ``file.h5:/dataset`` or ``store.zarr:/array``."""
+    match = re.fullmatch(r"(.*\.(?:h5|hdf5|zarr)):(/.*)", name, re.IGNORECASE)
     return (match[1], match[2]) if match else (name, None)
 
 
 def _expand(name: str) -> list[Source]:
-    file_name, dataset = _split_dataset(name)
+    file_name, dataset = split_dataset(name)
+    if is_url(file_name):
+        return [Source(name, Path(file_name), dataset, url=file_name)]
     path = Path(file_name)
-    if path.is_dir():
+    if path.is_dir() and not is_zarr_folder(path):
         try:
-            entries = sorted(path.iterdir(), key=_natural_key)
+            entries = sorted(path.iterdir(), key=lambda p: natural_key(p.name))
         except OSError as error:
             reason = error.strerror or str(error)
             return [Source(name, path, error=f"the folder cannot be read: {reason}")]
@@ -130,7 +140,7 @@ def _expand(name: str) -> list[Source]:
         ]
     if not path.exists() and glob.has_magic(file_name):
         matches = sorted(Path(match) for match in glob.glob(file_name, recursive=True))
-        matches.sort(key=lambda p: (str(p.parent), _natural_key(p)))
+        matches.sort(key=lambda p: (str(p.parent), natural_key(p.name)))
         sources = [Source(str(p), p, dataset) for p in matches if p.is_file()]
         return sources or [
             Source(name, path, error="no file matches this pattern; check it and the folder")
@@ -183,7 +193,9 @@ def _check(image: NDArray[Any]) -> tuple[str, ...]:
     return (f"{bad} of {image.size} pixels are NaN or infinite",) if bad else ()
 
 
-def _frame(source: Source, index: int, image: NDArray[Any], notes: tuple[str, ...]) -> Frame:
+def _frame(source: Source, index: int, stack: Stack) -> Frame:
+    image, notes = stack.read(index)
+    time_s = math.nan if stack.time_s is None else stack.time_s(index)
     notes += _check(image)
     bounds = lwdaq_bounds(image)
     if bounds is not None:
@@ -196,6 +208,8 @@ def _frame(source: Source, index: int, image: NDArray[Any], notes: tuple[str, ..
         bounds_px=bounds,
         header_rows=int(bounds is not None),
         notes=notes,
+        time_s=time_s,
+        time_source="metadata" if math.isfinite(time_s) else "",
     )
 
 
@@ -214,11 +228,11 @@ def _frames_of(source: Source, start: int) -> Generator[Frame, None, int]:
             yield _error_frame(source, 0, source.error)
         return max(0, start - 1)
     try:
-        with open_stack(source.path, source.dataset) as stack:
+        with open_stack(source.url or source.path, source.dataset) as stack:
             total, fault = stack.count, stack.error
             for index in range(start, total) if stack.counted else count(start):
                 try:
-                    frame = _frame(source, index, *stack.read(index))
+                    frame = _frame(source, index, stack)
                 except EndOfStack as end:
                     total, fault = end.count, end.error
                     break
@@ -237,10 +251,10 @@ def _frames_of(source: Source, start: int) -> Generator[Frame, None, int]:
 def iter_frames(paths: Iterable[PathLike | Source], start: int = 0) -> Iterator[Frame]:
     """Every frame of the files, folders and patterns named.
 
-    Reads PNG, TIFF (with pages), GIF, BMP, PGM, PPM, JPEG, NPY, HDF5 (two- or
-    three-dimensional; ``file.h5:/dataset`` where there are several) and video. Colour becomes
-    Rec. 601 luminance, which is noted. Nothing is kept in memory but the current frame, except
-    a PGM file's bytes.
+    Reads PNG, TIFF (with pages), GIF, BMP, PGM, PPM, JPEG, NPY, HDF5 and Zarr (two- or
+    three-dimensional; ``file.h5:/dataset`` where there are several) and video, also from URLs.
+    Colour becomes Rec. 601 luminance, which is noted. Nothing is kept in memory but the current
+    frame, except a PGM file's bytes and a chunk of a Zarr store.
 
     Parameters
     ----------
@@ -267,7 +281,7 @@ def count_frames(source: Source) -> int:
     if source.error is not None:
         return 1
     try:
-        with open_stack(source.path, source.dataset) as stack:
+        with open_stack(source.url or source.path, source.dataset) as stack:
             return stack.count + (stack.error is not None)
     except Exception:  # reported when the file is read
         return 1

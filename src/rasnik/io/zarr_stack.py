@@ -1,0 +1,148 @@
+"""Images in Zarr stores of version 2 or 3: arrays of (height, width) or (frames, height, width)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rasnik.io.formats import ImageFileError, Stack, frames_of_array
+
+__all__ = ["open_zarr", "zarr_bytes"]
+
+_TIMES = ("time_s", "host_time_s")
+_MOST_BYTES = 256 << 20  # of frames in memory
+
+
+@contextmanager
+def open_zarr(url: str, array: str | None = None) -> Iterator[Stack]:
+    """Open a Zarr store as a stack of grey images.
+
+    Frames are read chunk by chunk; the last chunk of frames is kept in memory. A one-dimensional
+    array ``time_s`` beside the images (or ``host_time_s``), as long as the stack, gives the
+    times of the frames.
+
+    Parameters
+    ----------
+    url : str
+        Folder, or URL of one.
+    array : str, optional
+        Path of the array in the store, needed if it holds several that can be images.
+
+    Raises
+    ------
+    ImageFileError
+        If there are no images in it.
+    """
+    item, group = _image_array(_opened(url), array, url)
+    if isinstance(item, str):
+        raise ImageFileError(item)
+    stack = frames_of_array(_Chunked(item), f"the array {item.path or 'of the store'}")
+    times = _times(group, stack.count)
+    yield Stack(stack.count, stack.read, time_s=None if times is None else times.__getitem__)
+
+
+def zarr_bytes(url: str) -> int:
+    """Bytes of the images in a store before compression; 0 if it cannot be read."""
+    try:
+        item, _ = _image_array(_opened(url), None, url)
+    except (ImageFileError, ImportError):
+        return 0
+    return 0 if isinstance(item, str) else int(item.nbytes)
+
+
+def _opened(url: str) -> Any:
+    """The array or group at a URL."""
+    try:
+        import zarr
+    except ImportError:
+        raise ImportError(
+            f'{url}: Zarr stores need zarr; install it with: pip install "rasnik[archive]"'
+        ) from None
+    try:
+        return zarr.open(url, mode="r")
+    except Exception as error:  # stores behind URLs have errors of their own
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise ImageFileError(f"the Zarr store cannot be opened ({text}); check it") from error
+
+
+def _image_array(opened: Any, array: str | None, url: str) -> tuple[Any, Any]:
+    """(array with the images, the group it lies in or None), or a sentence in its place."""
+    import zarr
+
+    if isinstance(opened, zarr.Array):
+        if array is None:
+            return opened, None
+        return f"the Zarr store is one array, there is no {array} in it", None
+    arrays = {f"/{k}": v for k, v in opened.members(None) if isinstance(v, zarr.Array)}
+    fitting = {name: v for name, v in arrays.items() if _can_be_images(v)}
+    for dimensions in (3, 2):  # stacks before single images, as in HDF5 files
+        names = [name for name, v in fitting.items() if v.ndim == dimensions]
+        if names:
+            break
+    listed = ", ".join(sorted(names)) or "no images"
+    if array is not None:
+        if f"/{array.strip('/')}" not in arrays:
+            return f"there is no array {array} in the Zarr store; it holds {listed}", None
+        name = f"/{array.strip('/')}"
+    elif len(names) == 1:
+        name = names[0]
+    elif names:
+        example = f"{url.rstrip('/').rpartition('/')[2]}:{sorted(names)[0]}"
+        return (
+            f"the Zarr store holds several arrays that can be images ({listed}); choose one, "
+            f"as in {example}"
+        ), None
+    else:
+        return (
+            "the Zarr store holds no image stack; an array of shape (frames, height, width) "
+            "is needed"
+        ), None
+    parent = name.rpartition("/")[0].strip("/")
+    return arrays[name], opened[parent] if parent else opened
+
+
+def _can_be_images(array: Any) -> bool:
+    return array.ndim in (2, 3) and np.dtype(array.dtype).kind in "uif"
+
+
+def _times(group: Any, count: int) -> NDArray[np.float64] | None:
+    """Times of the frames, if they lie beside the images."""
+    for name in _TIMES if group is not None else ():
+        if name in group and getattr(group[name], "shape", None) == (count,):
+            return np.asarray(group[name][:], dtype=np.float64)
+    return None
+
+
+class _Chunked:
+    """An array whose frames are read a chunk at a time."""
+
+    def __init__(self, array: Any) -> None:
+        self._array = array
+        self.shape, self.dtype = array.shape, array.dtype
+        frame_bytes = max(1, int(np.prod(self.shape[1:])) * np.dtype(self.dtype).itemsize)
+        # A chunk of very many frames is read in pieces, which costs time but bounds the memory.
+        self._length = max(1, min(array.chunks[0], _MOST_BYTES // frame_bytes))
+        self._start, self._block = -1, np.empty(0)
+
+    def __getitem__(self, index: Any) -> NDArray[Any]:
+        if index is Ellipsis:
+            return self._checked(np.asarray(self._array[...]))
+        start = index - index % self._length
+        if start != self._start:
+            self._block = np.asarray(self._array[start : start + self._length])
+            self._start = start
+        return self._checked(self._block[index - start])
+
+    def _checked(self, image: NDArray[Any]) -> NDArray[Any]:
+        """A chunk that is missing reads as an even grey, and must not pass for an image."""
+        fill = self._array.fill_value
+        if fill is not None and image.size and (image == fill).all():
+            raise ImageFileError(
+                f"every pixel is {fill}, as where a chunk of the Zarr store is missing; "
+                "write or copy it again"
+            )
+        return image
