@@ -231,3 +231,15 @@ def test_what_cannot_be_read_is_said() -> None:
         Placement([0, 0], np.eye(3))
     with pytest.raises(ValueError, match="use readings"):
         reading(Placement(np.zeros((2, 3)), np.eye(3)), LENS, SENSOR)
+
+
+def test_one_that_cannot_be_read_does_not_stop_the_others() -> None:
+    lenses = np.array([LENS, LENS + [0, 0, 200], LENS + [0, 0, 10]])
+    values, codes = readings(MASK, lenses, SENSOR, allow_missing=True)
+    assert codes.tolist() == [4, 0, 4]
+    assert np.isnan(values).any(axis=1).tolist() == [False, True, False]
+    slopes = derivatives(MASK, lenses, SENSOR, allow_missing=True)
+    assert np.isnan(slopes).all(axis=(1, 2)).tolist() == [False, True, False]
+    assert readings(MASK, LENS, SENSOR, 2, allow_missing=True)[1] == 0
+    with pytest.raises(ValueError, match="lens is not between"):
+        readings(MASK, lenses, SENSOR)

@@ -140,6 +140,8 @@ def readings(
     lens_mm: ArrayLike,
     sensor: Placement,
     orientation: ArrayLike | None = None,
+    *,
+    allow_missing: bool = False,
 ) -> tuple[Array, NDArray[np.int64]]:
     """What many Rasniks read; all arguments broadcast against each other.
 
@@ -150,6 +152,8 @@ def readings(
     lens_mm : array_like, shape (..., 3)
     orientation : array_like of int, shape (...), optional
         As in `reading`.
+    allow_missing : bool
+        Where nothing can be read, NaN and orientation 0 instead of an error.
 
     Returns
     -------
@@ -162,18 +166,17 @@ def readings(
     ValueError
         As `reading`, if it is so for any of them.
     """
-    lens, centre, axes = _in_mask(mask, lens_mm, sensor)
-    _check(lens, centre, axes)
+    lens, centre, axes = _checked(*_in_mask(mask, lens_mm, sensor), allow_missing)
     depth = centre[..., 2] - lens[..., 2]
     point = (centre[..., 2:] * lens - lens[..., 2:] * centre)[..., :2] / depth[..., None]
     jacobian = _jacobian(lens, centre, axes)
-    codes = _codes(jacobian, orientation)
+    codes = _codes(jacobian, orientation, allow_missing)
     across, along = _turned(jacobian, codes)
-    scale = 1 / np.sqrt(np.abs(np.linalg.det(jacobian)))
+    scale = 1 / np.sqrt(np.abs(_determinant(jacobian)))
     theta = np.arctan2(across, along)
     theta = np.where(theta == -np.pi, np.pi, theta)
     values = np.stack([*np.moveaxis(_UM_PER_MM * point, -1, 0), scale, theta], axis=-1)
-    return values, codes
+    return np.where(codes[..., None] > 0, values, np.nan), codes
 
 
 def derivatives(
@@ -181,12 +184,14 @@ def derivatives(
     lens_mm: ArrayLike,
     sensor: Placement,
     orientation: ArrayLike | None = None,
+    *,
+    allow_missing: bool = False,
 ) -> Array:
     """How readings change with small motions of the elements, in closed form.
 
     Parameters
     ----------
-    mask, lens_mm, sensor, orientation
+    mask, lens_mm, sensor, orientation, allow_missing
         As in `readings`.
 
     Returns
@@ -200,8 +205,7 @@ def derivatives(
     ValueError
         As `readings`.
     """
-    lens, centre, axes = _in_mask(mask, lens_mm, sensor)
-    _check(lens, centre, axes)
+    lens, centre, axes = _checked(*_in_mask(mask, lens_mm, sensor), allow_missing)
     d_lens, d_centre, d_axes = _motions(mask, lens_mm, sensor)
     # one axis more: the motions
     L, P, A = lens[..., None, :], centre[..., None, :], axes[..., None, :, :]
@@ -220,14 +224,14 @@ def derivatives(
     d_jacobian = -dt[..., None] * fan - t[..., None] * d_fan
 
     jacobian = _jacobian(lens, centre, axes)
-    codes = _codes(jacobian, orientation)
-    scale = 1 / np.sqrt(np.abs(np.linalg.det(jacobian)))
-    relative = np.linalg.inv(jacobian)[..., None, :, :] @ d_jacobian
-    d_scale = -0.5 * scale[..., None] * np.trace(relative, axis1=-2, axis2=-1)
+    codes = _codes(jacobian, orientation, allow_missing)
+    scale = 1 / np.sqrt(np.abs(_determinant(jacobian)))
+    d_scale = -0.5 * scale[..., None] * _relative_growth(jacobian[..., None, :, :], d_jacobian)
     across, along = (one[..., None] for one in _turned(jacobian, codes))
     d_across, d_along = _turned(d_jacobian, codes[..., None])
     d_theta = (along * d_across - across * d_along) / (across**2 + along**2)
-    return np.stack([d_point[..., 0], d_point[..., 1], d_scale, d_theta], axis=-2)
+    slopes = np.stack([d_point[..., 0], d_point[..., 1], d_scale, d_theta], axis=-2)
+    return np.where(codes[..., None, None] > 0, slopes, np.nan)
 
 
 def projection(mask: Placement, lens_mm: ArrayLike, sensor: Placement) -> Projection:
@@ -238,8 +242,7 @@ def projection(mask: Placement, lens_mm: ArrayLike, sensor: Placement) -> Projec
     ValueError
         As `reading`.
     """
-    lens, centre, axes = _in_mask(mask, lens_mm, sensor)
-    _check(lens, centre, axes)
+    lens, centre, axes = _checked(*_in_mask(mask, lens_mm, sensor), allow_missing=False)
     # columns: what u, v (um) and 1 contribute to the sensor's point, in mm
     columns = np.column_stack([axes / _UM_PER_MM, centre])
     numerators = np.outer(lens, columns[2]) - lens[2] * columns
@@ -265,23 +268,41 @@ def _times(matrix: Array, vector: Array) -> Array:
     return (matrix @ vector[..., None])[..., 0]
 
 
-def _check(lens: Array, centre: Array, axes: Array) -> None:
-    if not (np.isfinite(lens).all() and np.isfinite(centre).all() and np.isfinite(axes).all()):
-        raise ValueError("a position or rotation of mask, lens or sensor is not a finite number")
+def _checked(
+    lens: Array, centre: Array, axes: Array, allow_missing: bool
+) -> tuple[Array, Array, Array]:
+    """The same, NaN where nothing can be read; raises if that is not allowed."""
+    known = (
+        np.isfinite(lens).all(-1) & np.isfinite(centre).all(-1) & np.isfinite(axes).all((-2, -1))
+    )
     line = lens - centre
     length = np.linalg.norm(line, axis=-1)
-    if np.any(length == 0):
-        raise ValueError("lens and sensor are at the same place")
-    if np.any(np.abs(line[..., 2]) <= _GRAZING * length):
-        raise ValueError("the line from sensor through lens runs along the mask and never meets it")
-    if np.any(lens[..., 2] * (centre - lens)[..., 2] <= 0):
-        raise ValueError(
-            "the lens is not between mask and sensor; check the positions and the order mask, "
-            "lens, sensor"
-        )
     normal = np.cross(axes[..., 0], axes[..., 1])
-    if np.any(np.abs(np.sum(normal * line, axis=-1)) <= _GRAZING * length):
-        raise ValueError("the sensor is seen edge on from the lens: no light falls on it")
+    faults = {
+        "a position or rotation of mask, lens or sensor is not a finite number": ~known,
+        "lens and sensor are at the same place": length == 0,
+        "the line from sensor through lens runs along the mask and never meets it": (
+            np.abs(line[..., 2]) <= _GRAZING * length
+        ),
+        "the lens is not between mask and sensor; check the positions and the order mask, lens, "
+        "sensor": lens[..., 2] * line[..., 2] >= 0,
+        "the sensor is seen edge on from the lens: no light falls on it": (
+            np.abs(np.sum(normal * line, axis=-1)) <= _GRAZING * length
+        ),
+    }
+    missing = np.zeros(length.shape, dtype=bool)
+    for sentence, where in faults.items():
+        if where.any() and not allow_missing:
+            raise ValueError(sentence)
+        missing |= where
+    if not missing.any():
+        return lens, centre, axes
+    gone = missing[..., None]
+    return (
+        np.where(gone, np.nan, lens),
+        np.where(gone, np.nan, centre),
+        np.where(gone[..., None], np.nan, axes),
+    )
 
 
 def _jacobian(lens: Array, centre: Array, axes: Array) -> Array:
@@ -292,20 +313,37 @@ def _jacobian(lens: Array, centre: Array, axes: Array) -> Array:
     return -(lens[..., 2] / depth)[..., None, None] * fan
 
 
-def _codes(jacobian: Array, orientation: ArrayLike | None) -> NDArray[np.int64]:
-    """Orientation codes: those given if they are possible, else those of the smaller rotation."""
-    mirrored = np.linalg.det(jacobian) > 0
-    first = np.where(mirrored, 2, 1)
+def _determinant(matrix: Array) -> Array:
+    # numpy's own warns of NaN
+    return matrix[..., 0, 0] * matrix[..., 1, 1] - matrix[..., 0, 1] * matrix[..., 1, 0]
+
+
+def _relative_growth(matrix: Array, change: Array) -> Array:
+    """Relative change of a determinant."""
+    (a, b), (c, d) = ([matrix[..., i, j] for j in (0, 1)] for i in (0, 1))
+    (da, db), (dc, dd) = ([change[..., i, j] for j in (0, 1)] for i in (0, 1))
+    return (da * d + a * dd - db * c - b * dc) / (a * d - b * c)
+
+
+def _codes(
+    jacobian: Array, orientation: ArrayLike | None, allow_missing: bool
+) -> NDArray[np.int64]:
+    """Codes: those given if they are possible, else those of the smaller rotation; 0 for none."""
+    determinant = _determinant(jacobian)
+    first = np.where(determinant > 0, 2, 1)
     if orientation is None:
         _, along = _turned(jacobian, first)
-        return np.where(along >= 0, first, 5 - first)  # 1 and 4, 2 and 3 are half a turn apart
-    codes = np.broadcast_to(np.asarray(orientation, dtype=np.int64), first.shape)
-    if np.any((codes != first) & (codes != 5 - first)):
+        # 1 and 4, 2 and 3 are half a turn apart
+        codes = np.where(along >= 0, first, 5 - first)
+    else:
+        codes = np.broadcast_to(np.asarray(orientation, dtype=np.int64), first.shape)
+    possible = np.isfinite(determinant) & ((codes == first) | (codes == 5 - first))
+    if not (possible.all() or allow_missing):
+        pairs = " or ".join({1: "1 and 4", 2: "2 and 3"}[one] for one in np.unique(first))
         raise ValueError(
-            f"orientation {orientation} is not possible here: the elements as placed give codes "
-            f"{' or '.join('2 and 3' if one else '1 and 4' for one in np.unique(mirrored))}"
+            f"orientation {orientation!r} is not possible here: the elements as placed give {pairs}"
         )
-    return codes
+    return np.where(possible, codes, 0)
 
 
 def _turned(jacobian: Array, codes: NDArray[np.int64]) -> tuple[Array, Array]:
