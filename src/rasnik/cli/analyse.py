@@ -150,11 +150,12 @@ def analyse_command(
     edges = parse_bounds(bounds) if bounds is not None else None
     instrument = load(system, settings or ()) if system is not None else None
 
-    from rasnik.cli.batch import Destination, Options, run_batch
+    from rasnik.cli.batch import Destination, run_batch
+    from rasnik.io.analysed import AnalysisOptions
 
     all_good = run_batch(
         images,
-        Options(
+        AnalysisOptions(
             system=instrument,
             field_um=field_um,
             pixel_um=pixel_um,

@@ -9,11 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
 from rasnik.cli.common import fail, messages, output
+from rasnik.io.analysed import AnalysisOptions, analysed
 from rasnik.io.images import Frame, Source, count_frames, expand_paths, iter_frames
 
 if TYPE_CHECKING:
@@ -23,22 +24,9 @@ if TYPE_CHECKING:
 
 _MOST_CANDIDATES = 4
 
-__all__ = ["Destination", "Options", "run_batch", "system_of"]
+__all__ = ["Destination", "run_batch", "system_of"]
 
 _COUNTED_SOURCES = 200  # with more, opening each only to count its frames takes too long
-
-
-@dataclass(frozen=True)
-class Options:
-    """How images are analysed: the instrument or the two sizes, and what `analyse` takes."""
-
-    system: System | None
-    field_um: float | None
-    pixel_um: float | None
-    method: Literal["likelihood", "fourier"]
-    model: Literal["auto", "similarity", "affine", "projective"]
-    orientation: int | None
-    bounds: tuple[int, int, int, int] | None
 
 
 @dataclass(frozen=True)
@@ -62,7 +50,7 @@ class _Outcome:
     rows: list[tuple[Frame, Pose | None, str | None]] = field(default_factory=list)
 
 
-def run_batch(images: list[str], options: Options, destination: Destination) -> bool:
+def run_batch(images: list[str], options: AnalysisOptions, destination: Destination) -> bool:
     """Analyse every frame of the images named; True if each gave a position.
 
     A frame that fails is a result as well: it is written with its error, and the others
@@ -79,7 +67,7 @@ def run_batch(images: list[str], options: Options, destination: Destination) -> 
         overlays = _Overlays(destination.overlays, options) if destination.overlays else None
         advance = opened.enter_context(_progress(sources))
         for frame in iter_frames(sources):
-            pose, error = _analyse(frame, options)
+            pose, error = analysed(frame, options)
             outcome.good += error is None
             outcome.failed += error is not None
             if error is not None:
@@ -93,32 +81,6 @@ def run_batch(images: list[str], options: Options, destination: Destination) -> 
             advance()
     _report(outcome, destination, as_table)
     return outcome.failed == 0
-
-
-def _analyse(frame: Frame, options: Options) -> tuple[Pose | None, str | None]:
-    """Pose of a frame, and the sentence that says why there is no position."""
-    from rasnik.analysis.analyse import analyse
-
-    name = f"{frame.file}[{frame.frame}]" if frame.frame else frame.file
-    if frame.image is None:
-        return None, frame.error
-    try:
-        pose = analyse(
-            frame.image,
-            options.system,
-            field_um=options.field_um,
-            pixel_um=options.pixel_um,
-            method=options.method,
-            model=options.model,
-            orientation=options.orientation,
-            bounds=frame.clip_bounds(options.bounds),
-        )
-    except ValueError as error:
-        return None, f"{name}: {str(error).rstrip('.')}."
-    except Exception as error:  # a fault of ours in one frame must not lose the others
-        kind = type(error).__name__
-        return None, f"{name}: unexpected {kind} ({error}); please report it."
-    return pose, None if pose.ok else f"{name}: {pose.error}"
 
 
 def _candidates(pose: Pose | None) -> list[str]:
@@ -139,7 +101,7 @@ def _candidates(pose: Pose | None) -> list[str]:
 
 
 def _open_writer(
-    opened: ExitStack, destination: Destination, options: Options, sources: list[Source]
+    opened: ExitStack, destination: Destination, options: AnalysisOptions, sources: list[Source]
 ) -> ResultWriter | None:
     from rasnik.io.results import CsvWriter, JsonLinesWriter, open_results
 
@@ -188,7 +150,7 @@ def _write(
 class _Overlays:
     """Draws overlays into a folder, each under a name of its own."""
 
-    def __init__(self, folder: Path, options: Options) -> None:
+    def __init__(self, folder: Path, options: AnalysisOptions) -> None:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -227,7 +189,7 @@ class _Overlays:
         return self._folder / f"{unique}.png"
 
 
-def system_of(frame: Frame, options: Options) -> System:
+def system_of(frame: Frame, options: AnalysisOptions) -> System:
     """A system with the image's own size, for field and pixel sizes alone."""
     from rasnik.instrument import Optics, Sensor, System
     from rasnik.mask import ChessField

@@ -175,11 +175,12 @@ def _of_frame(
     """The edges of one frame. Which of several positions it shows does not matter to them."""
     from rasnik import Pose, analyse
     from rasnik.characterisation.edges import edges
-    from rasnik.cli.batch import Options, system_of
+    from rasnik.cli.batch import system_of
+    from rasnik.io.analysed import AnalysisOptions
 
     if frame.image is None:
         raise ValueError(frame.error)
-    used = system or system_of(frame, Options(None, *sizes, "likelihood", "auto", None, None))
+    used = system or system_of(frame, AnalysisOptions(None, *sizes))
     clipped = frame.clip_bounds(bounds)
     pose = analyse(frame.image, used, bounds=clipped)
     if not pose.ok and pose.candidates:

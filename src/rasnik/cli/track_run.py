@@ -22,6 +22,7 @@ from rich.markup import escape
 from rasnik.cli.common import fail, messages
 from rasnik.cli.track_summary import Summary
 from rasnik.cli.track_terminal import Interrupts, progress
+from rasnik.io.analysed import frame_name
 from rasnik.io.file_lock import FileLock
 from rasnik.io.images import Frame, Source, expand_paths, iter_frames
 from rasnik.io.read_ahead import read_ahead
@@ -274,7 +275,7 @@ def _images(
         elif image.shape != system.shape:
             height, width = image.shape
             reasons[number] = (
-                f"{_name(frame)}: the image has {width} x {height} pixels, the system "
+                f"{frame_name(frame)}: the image has {width} x {height} pixels, the system "
                 f"{system.shape[1]} x {system.shape[0]}; change sensor.width_px, height_px or "
                 "binning."
             )
@@ -316,17 +317,13 @@ def _next_size(frames: int, seconds: float, images: list[NDArray[Any] | None]) -
     return min(most, 4 * frames, max(1, fast_enough))
 
 
-def _name(frame: Frame) -> str:
-    return f"{frame.file}[{frame.frame}]" if frame.frame else frame.file
-
-
 def _named(block: Track, chunk: list[Frame], reasons: dict[int, str]) -> dict[int, str]:
     """Reasons of all failures, each with the name of the file."""
     from rasnik.analysis.flags import FLAGS
 
     named = dict(reasons)
     for row in np.flatnonzero(~block.ok):
-        number, flags, name = int(block.frame[row]), int(block.flags[row]), _name(chunk[row])
+        number, flags, name = int(block.frame[row]), int(block.flags[row]), frame_name(chunk[row])
         if number in named:
             if name not in named[number]:
                 named[number] = f"{name}: {named[number]}"

@@ -7,7 +7,7 @@ crash that file holds every record; `rasnik.io.results.read_results` reads it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,8 @@ __all__ = [
     "partial_path",
     "read_columns",
     "read_parquet",
+    "record_schema",
+    "record_table",
     "write_columns",
 ]
 
@@ -42,7 +44,8 @@ def partial_path(path: Path) -> Path:
     return path.with_name(path.name + ".partial.jsonl")
 
 
-def _schema(metadata: dict[str, str]) -> Any:
+def record_schema(metadata: Mapping[str, str], more: Sequence[Column] = ()) -> Any:
+    """Arrow schema of records, with further columns if there are any."""
     candidate = pyarrow.struct(
         [
             (name, pyarrow.int64() if name == "orientation" else pyarrow.float64())
@@ -56,12 +59,12 @@ def _schema(metadata: dict[str, str]) -> Any:
         "flags": pyarrow.list_(pyarrow.string()),
     }
     fields = []
-    for column in COLUMNS:
+    for column in (*COLUMNS, *more):
         kind = types.get(column.kind, pyarrow.string())
         if column.name == "candidates":
             kind = pyarrow.list_(candidate)
         fields.append(_field(column, kind))
-    return pyarrow.schema(fields, metadata=metadata)
+    return pyarrow.schema(fields, metadata=dict(metadata))
 
 
 def _field(column: Column | TrackColumn, kind: Any) -> Any:
@@ -70,8 +73,13 @@ def _field(column: Column | TrackColumn, kind: Any) -> Any:
     return pyarrow.field(column.name, kind, metadata=about)
 
 
-def _row(record: Record) -> dict[str, Any]:
-    row = {column.name: record.get(column.name) for column in COLUMNS}
+def record_table(records: Iterable[Record], schema: Any) -> Any:
+    """Arrow table of records, with the columns of a schema by `record_schema`."""
+    return pyarrow.Table.from_pylist([_row(r, schema.names) for r in records], schema=schema)
+
+
+def _row(record: Record, names: Iterable[str]) -> dict[str, Any]:
+    row = {name: record.get(name) for name in names}
     row["flags"] = flag_value(row["flags"]).names
     row["notes"] = joined(row["notes"])
     return row
@@ -97,11 +105,11 @@ class ParquetWriter(ResultWriter):
         self._lines.close()
         partial = partial_path(self._path)
         unfinished = self._path.with_name(self._path.name + ".partial")
-        schema = _schema(self._metadata)
+        schema = record_schema(self._metadata)
         with parquet.ParquetWriter(unfinished, schema) as writer:
             records = read_json_lines(partial)
-            while rows := [_row(record) for record in islice(records, _BATCH_ROWS)]:
-                writer.write_table(pyarrow.Table.from_pylist(rows, schema=schema))
+            while rows := list(islice(records, _BATCH_ROWS)):
+                writer.write_table(record_table(rows, schema))
         unfinished.replace(self._path)
         partial.unlink()
 
