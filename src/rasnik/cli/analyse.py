@@ -107,13 +107,20 @@ def analyse_command(
     as_csv: Annotated[
         bool, typer.Option("--csv", help="CSV instead of a table.", rich_help_panel=_OUTPUT)
     ] = False,
+    as_lwdaq: Annotated[
+        bool,
+        typer.Option(
+            "--lwdaq", help="LWDAQ's result lines instead of a table.", rich_help_panel=_OUTPUT
+        ),
+    ] = False,
     output: Annotated[
         Path | None,
         typer.Option(
             "--output",
             "-o",
             metavar="FILE",
-            help="Write results to a file: .jsonl, .csv, .h5 or .parquet.",
+            help="Write results to a file: .jsonl, .csv, .h5 or .parquet; .txt for lines of "
+            "LWDAQ, .icaras for those of ICARAS.",
             rich_help_panel=_OUTPUT,
         ),
     ] = None,
@@ -140,8 +147,8 @@ def analyse_command(
 
     rasnik analyse image.png --system solidras --json | jq .x_um
     """
-    if sum((as_json, as_csv, output is not None)) > 1:
-        fail("--json, --csv and -o exclude each other; give one of them.")
+    if sum((as_json, as_csv, as_lwdaq, output is not None)) > 1:
+        fail("--json, --csv, --lwdaq and -o exclude each other; give one of them.")
     if orientation not in _ORIENTATIONS:
         fail(f"--orientation {orientation!r} is not known; give auto, 1, 2, 3 or 4.")
     check_instrument(system, settings, field_um, pixel_um)
@@ -164,7 +171,7 @@ def analyse_command(
             orientation=_ORIENTATIONS[orientation],
             bounds=edges,
         ),
-        Destination(json=as_json, csv=as_csv, file=output, overlays=overlay),
+        Destination(json=as_json, csv=as_csv, lwdaq=as_lwdaq, file=output, overlays=overlay),
     )
     raise typer.Exit(0 if all_good else 1)
 

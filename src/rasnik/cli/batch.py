@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
 from rich.markup import escape
 
@@ -20,6 +20,7 @@ from rasnik.io.images import Frame, Source, count_frames, expand_paths, iter_fra
 if TYPE_CHECKING:
     from rasnik.analysis.pose import Pose
     from rasnik.instrument import System
+    from rasnik.io.lwdaq_results import LwdaqWriter
     from rasnik.io.results import ResultWriter
 
 _MOST_CANDIDATES = 4
@@ -35,6 +36,7 @@ class Destination:
 
     json: bool = False
     csv: bool = False
+    lwdaq: bool = False
     file: Path | None = None
     overlays: Path | None = None
 
@@ -61,7 +63,7 @@ def run_batch(images: list[str], options: AnalysisOptions, destination: Destinat
         fail(f"there are no images: {'; '.join(f'{s.name}: {s.error}' for s in sources)}.")
     logging.getLogger("tifffile").setLevel(logging.CRITICAL)  # faults come out as errors
     outcome = _Outcome()
-    as_table = not (destination.json or destination.csv or destination.file)
+    as_table = destination == Destination(overlays=destination.overlays)
     with ExitStack() as opened:
         writer = _open_writer(opened, destination, options, sources)
         overlays = _Overlays(destination.overlays, options) if destination.overlays else None
@@ -102,13 +104,15 @@ def _candidates(pose: Pose | None) -> list[str]:
 
 def _open_writer(
     opened: ExitStack, destination: Destination, options: AnalysisOptions, sources: list[Source]
-) -> ResultWriter | None:
+) -> ResultWriter | LwdaqWriter | None:
     from rasnik.io.results import CsvWriter, JsonLinesWriter, open_results
 
     if destination.json:
         return JsonLinesWriter(sys.stdout)
     if destination.csv:
         return CsvWriter(sys.stdout)
+    if destination.lwdaq:
+        return _lwdaq_writer(sys.stdout, options)
     if destination.file is None:
         return None
     path = destination.file
@@ -117,6 +121,8 @@ def _open_writer(
     if not path.parent.is_dir():
         fail(f"{path} cannot be written: there is no folder {path.parent}.")
     try:
+        if path.suffix.lower() == ".txt":
+            return opened.enter_context(_lwdaq_writer(path, options))
         return opened.enter_context(open_results(path, system=options.system))
     except (ValueError, ImportError, FileExistsError) as error:
         fail(f"{error}.")
@@ -124,23 +130,41 @@ def _open_writer(
         fail(f"{path} cannot be written: {error.strerror or error}.")
 
 
+def _lwdaq_writer(target: Path | TextIO, options: AnalysisOptions) -> LwdaqWriter:
+    from rasnik.io.lwdaq_results import LwdaqWriter
+
+    if options.system is not None:
+        sizes = {"square_um": options.system.mask.field_um, "pixel_um": options.system.pitch_um}
+    else:
+        assert options.field_um is not None
+        assert options.pixel_um is not None
+        sizes = {"square_um": options.field_um, "pixel_um": options.pixel_um}
+    return LwdaqWriter(target, **sizes)
+
+
 def _same_file(one: Path, other: Path) -> bool:
     return other.exists() and os.path.samefile(one, other)
 
 
 def _write(
-    writer: ResultWriter,
+    writer: ResultWriter | LwdaqWriter,
     destination: Destination,
     frame: Frame,
     pose: Pose | None,
     error: str | None,
 ) -> None:
     from rasnik.io.columns import make_record
+    from rasnik.io.lwdaq_results import LwdaqWriter
 
     own_error = None if pose is not None else error
-    record = make_record(frame.file, frame.frame, pose, error=own_error, notes=frame.notes)
     try:
-        writer.write(record)
+        if isinstance(writer, LwdaqWriter):
+            name = f"{frame.file}[{frame.frame}]" if frame.frame else frame.file
+            shape = frame.image.shape if frame.image is not None else (0, 0)
+            writer.write(name, pose, shape, error or "")
+        else:
+            notes = frame.notes
+            writer.write(make_record(frame.file, frame.frame, pose, error=own_error, notes=notes))
     except BrokenPipeError:  # whoever read the output has seen enough
         raise
     except OSError as fault:

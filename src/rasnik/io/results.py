@@ -7,7 +7,9 @@
 ``.parquet`` Parquet (see `rasnik.io.parquet`); needs ``pip install "rasnik[parquet]"``
 ========== ============================================================================
 
-The columns are those of `rasnik.io.columns.COLUMNS` in all of them. Every record is on its way
+The columns are those of `rasnik.io.columns.COLUMNS` in all of them. Lines of ICARAS
+(``.icaras``) are written and read too, those of LWDAQ (``.txt``) read; they hold some of the
+columns, see `rasnik.io.icaras` and `rasnik.io.lwdaq_results`. Every record is on its way
 to the disk when `write` returns: a killed program loses none.
 """
 
@@ -27,11 +29,13 @@ from numpy.typing import NDArray
 
 from rasnik import __version__
 from rasnik.io.columns import COLUMNS, CONVENTIONS, check_record, flag_value, plain
+from rasnik.io.line_file import LineFile
 
 if TYPE_CHECKING:
     from rasnik.instrument import System
 
 __all__ = [
+    "LINE_SUFFIXES",
     "RESULT_SUFFIXES",
     "CsvWriter",
     "JsonLinesWriter",
@@ -43,7 +47,10 @@ __all__ = [
 
 Record = Mapping[str, Any]
 
+#: Formats that hold every column.
 RESULT_SUFFIXES = (".jsonl", ".csv", ".h5", ".hdf5", ".parquet")
+#: Formats of other programs, which hold some of them: lines of LWDAQ and of ICARAS.
+LINE_SUFFIXES = (".txt", ".icaras")
 
 
 class ResultWriter(ABC):
@@ -69,32 +76,15 @@ class ResultWriter(ABC):
         self.close()
 
 
-class _TextWriter(ResultWriter):
-    """Records as lines of text, each handed to the system at once."""
-
-    def __init__(self, target: str | os.PathLike[str] | TextIO) -> None:
-        self._owned = isinstance(target, str | os.PathLike)
-        self._file: TextIO = (
-            open(target, "w", encoding="utf-8", newline="")
-            if isinstance(target, str | os.PathLike)
-            else target
-        )
-
-    def close(self) -> None:
-        if self._owned:
-            self._file.close()
-
-
-class JsonLinesWriter(_TextWriter):
+class JsonLinesWriter(LineFile, ResultWriter):
     """One JSON object per line; NaN and infinities are null. Takes a path or an open text file."""
 
     def write(self, record: Record) -> None:
         check_record(record)
-        self._file.write(json_line(record))
-        self._file.flush()
+        self.put(json_line(record))
 
 
-class CsvWriter(_TextWriter):
+class CsvWriter(LineFile, ResultWriter):
     """Comma-separated values with a header line. Takes a path or an open text file."""
 
     def __init__(self, target: str | os.PathLike[str] | TextIO) -> None:
@@ -148,7 +138,7 @@ def open_results(path: str | os.PathLike[str], *, system: System | None = None) 
     Parameters
     ----------
     path : path-like
-        Ends in one of `RESULT_SUFFIXES`.
+        Ends in one of `RESULT_SUFFIXES`, or in ``.icaras``.
     system : System, optional
         Stored as TOML in HDF5 and Parquet files.
 
@@ -179,13 +169,17 @@ def open_results(path: str | os.PathLike[str], *, system: System | None = None) 
             from rasnik.io.parquet import ParquetWriter
 
             return ParquetWriter(path, file_metadata(system))
+        case ".icaras":
+            from rasnik.io.icaras import IcarasWriter
+
+            return IcarasWriter(path)
     raise ValueError(_unknown_suffix(path))
 
 
 def _unknown_suffix(path: Path) -> str:
     return (
         f"{path}: {path.suffix or 'no suffix'} is not a format of results; "
-        f"end the name in one of {', '.join(RESULT_SUFFIXES)}"
+        f"end the name in one of {', '.join((*RESULT_SUFFIXES, *LINE_SUFFIXES))}"
     )
 
 
@@ -198,7 +192,8 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
     Parameters
     ----------
     path : path-like
-        A file written by `open_results`, also one whose writer was killed or still runs.
+        A file written by `open_results`, also one whose writer was killed or still runs; or,
+        ending in ``.txt``, lines of LWDAQ (`rasnik.io.lwdaq_results`).
 
     Returns
     -------
@@ -228,6 +223,14 @@ def read_results(path: str | os.PathLike[str]) -> dict[str, NDArray[Any]]:
             from rasnik.io.parquet import read_parquet
 
             return to_arrays(read_parquet(path))
+        case ".icaras":
+            from rasnik.io.icaras import icaras_records
+
+            return to_arrays(icaras_records(path))
+        case ".txt":
+            from rasnik.io.lwdaq_results import read_lwdaq_results
+
+            return to_arrays(read_lwdaq_results(path))
     raise ValueError(_unknown_suffix(path))
 
 
