@@ -194,6 +194,8 @@ class _Search:
 
 
 def _reason(error: Exception) -> str:
+    if isinstance(error, OSError) and error.errno is None:
+        return str(error)  # a sentence already
     if isinstance(error, FileNotFoundError):
         return "there is no such file or folder; check the name"
     if isinstance(error, PermissionError):

@@ -251,7 +251,7 @@ def _open_pnm(path: Path) -> Iterator[Stack]:
     yield Stack(len(headers), read)
 
 
-# ------------------------------------------------------------------------ NumPy, HDF5
+# ------------------------------------------------------------------------ NumPy and other arrays
 
 
 def frames_of_array(array: Any, what: str) -> Stack:
@@ -290,48 +290,6 @@ def _open_npy(path: Path) -> Iterator[Stack]:
             f"the array cannot be read ({error}); store grey levels as integers or floats"
         ) from error
     yield frames_of_array(array, "the array")
-
-
-def _hdf5_candidates(file: Any) -> list[str]:
-    """Datasets that can be images: numeric, three-dimensional, else two-dimensional."""
-    import h5py
-
-    found: dict[int, list[str]] = {2: [], 3: []}
-
-    def visit(name: str, item: object) -> None:
-        if isinstance(item, h5py.Dataset) and item.ndim in found and item.dtype.kind in "uif":
-            found[item.ndim].append("/" + name)
-
-    file.visititems(visit)
-    return found[3] or found[2]
-
-
-@contextmanager
-def _open_hdf5(path: Path, dataset: str | None) -> Iterator[Stack]:
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        if dataset is None:
-            names = _hdf5_candidates(file)
-            if not names:
-                raise ImageFileError(
-                    "the HDF5 file holds no image stack; a dataset of shape "
-                    "(frames, height, width) is needed"
-                )
-            if len(names) > 1:
-                raise ImageFileError(
-                    f"the HDF5 file holds several datasets that can be images "
-                    f"({', '.join(names)}); choose one, as in {path.name}:{names[0]}"
-                )
-            dataset = names[0]
-        item = file.get(dataset)
-        if not isinstance(item, h5py.Dataset):
-            names = _hdf5_candidates(file)
-            raise ImageFileError(
-                f"there is no dataset {dataset} in the HDF5 file; "
-                f"it holds {', '.join(names) if names else 'no images'}"
-            )
-        yield frames_of_array(item, f"dataset {dataset}")
 
 
 # ------------------------------------------------------------------------ which decoder
@@ -417,7 +375,9 @@ def open_stack(path: Path | str, dataset: str | None = None) -> AbstractContextM
     if is_hdf5 or suffix in STACK_SUFFIXES:
         if not is_hdf5:
             raise ImageFileError(f"the content is not HDF5, as {suffix} promises; check the file")
-        return _open_hdf5(path, dataset)
+        from rasnik.io.hdf5_stack import open_hdf5
+
+        return open_hdf5(path, dataset)
     if dataset is not None:
         raise ImageFileError(f"this is not an HDF5 file, so it has no dataset {dataset}")
     for magic, opener in _MAGIC:

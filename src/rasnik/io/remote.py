@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -43,14 +44,23 @@ def remote_entry(url: str) -> Entry:
 def list_remote(url: str) -> list[Entry]:
     """What a folder behind a URL holds; raises OSError with a sentence."""
     system, path = _connect(url)
-    rest = url.partition("::")[2]
-    entries = []
-    for info in _tried(url, lambda: system.ls(path, detail=True)):
-        if info["name"].strip("/") == path.strip("/"):
-            continue  # stores of objects list the folder itself
-        one = system.unstrip_protocol(info["name"])
-        entries.append(_entry(f"{one}::{rest}" if rest else one, info))
-    return entries
+    return [
+        _entry(_below(url, info["name"]), info)
+        for info in _tried(url, lambda: system.ls(path, detail=True))
+        if info["name"].strip("/") != path.strip("/")  # stores of objects list the folder itself
+    ]
+
+
+def _below(folder: str, name: str) -> str:
+    """URL of what lies in a folder, from its name as the file system has it."""
+    if "://" in name:
+        return name
+    first, chain, rest = folder.partition("::")
+    last = name.rstrip("/").rpartition("/")[2]
+    if "://" not in first:  # simplecache::s3://bucket/folder
+        return f"{folder.rstrip('/')}/{last}"
+    top = first if first.endswith("://") else f"{first.rstrip('/')}/"
+    return f"{top}{last}{chain}{rest}"
 
 
 @contextmanager
@@ -117,12 +127,27 @@ def _connect(url: str) -> tuple[Any, str]:
             f'{url}: URLs need fsspec; install it with: pip install "rasnik[archive]"'
         ) from None
     try:
+        first, _, packed = url.partition("::")
+        protocol, _, inside = first.partition("://")
+        if protocol in ("zip", "tar"):
+            return _tried(url, lambda: _unpacking(protocol, packed)), inside.strip("/")
         system, path = _tried(url, lambda: fsspec.core.url_to_fs(url))
     except ImportError as error:
         raise ImportError(f"{url.partition(':')[0]}:// needs another package: {error}") from None
     except ValueError as error:
         raise OSError(f"the URL is of no kind known here ({error}); check its beginning") from None
     return system, path
+
+
+@lru_cache(maxsize=8)
+def _unpacking(protocol: str, packed: str) -> Any:
+    """The file system inside a packed file; its list of files is read once, and it stays open.
+
+    fsspec would keep all of them open for ever.
+    """
+    import fsspec
+
+    return fsspec.filesystem(protocol, fo=packed, skip_instance_cache=True)
 
 
 def _tried(url: str, action: Callable[[], Result]) -> Result:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from datetime import UTC
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -116,9 +118,20 @@ def _contiguous_frame(path: Path, series: Any, index: int) -> Image:
     return pixels.reshape(page.shape).astype(series.dtype.newbyteorder("="))
 
 
+def _date(page: Any) -> float:
+    """The date of a page, taken as UTC, in s since 1970; NaN without one."""
+    try:
+        date = page.aspage().datetime
+    except (AttributeError, ValueError):
+        return math.nan
+    return math.nan if date is None else float(date.replace(tzinfo=UTC).timestamp())
+
+
 @contextmanager
 def open_tiff(path: Path) -> Iterator[Stack]:
     """Open a TIFF file as a stack of grey images; thumbnails are left out.
+
+    The time of a frame is the date of its page, or that of the first page.
 
     Raises
     ------
@@ -161,4 +174,10 @@ def open_tiff(path: Path) -> Iterator[Stack]:
                     return stack.read(page.index)
             return _grey_levels(pixels, page)
 
-        yield Stack(len(frames), read, None if complete and all_there else _TRUNCATED)
+        def time_s(index: int) -> float:
+            source, part = frames[index]
+            own = _date(source if part is None else source.pages[0])
+            return own if math.isfinite(own) else _date(tif.pages.first)
+
+        fault = None if complete and all_there else _TRUNCATED
+        yield Stack(len(frames), read, fault, time_s=time_s)

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rasnik.io.array_choice import choose_images
 from rasnik.io.formats import ImageFileError, Stack, frames_of_array
+from rasnik.io.hdf5_stack import TIME_NAMES, times_as_function
 
 __all__ = ["open_zarr", "zarr_bytes"]
 
-_TIMES = ("time_s", "host_time_s")
 _MOST_BYTES = 256 << 20  # of frames in memory
 
 
@@ -38,11 +39,8 @@ def open_zarr(url: str, array: str | None = None) -> Iterator[Stack]:
         If there are no images in it.
     """
     item, group = _image_array(_opened(url), array, url)
-    if isinstance(item, str):
-        raise ImageFileError(item)
     stack = frames_of_array(_Chunked(item), f"the array {item.path or 'of the store'}")
-    times = _times(group, stack.count)
-    yield Stack(stack.count, stack.read, time_s=None if times is None else times.__getitem__)
+    yield Stack(stack.count, stack.read, time_s=times_as_function(_times(group), stack.count))
 
 
 def zarr_bytes(url: str) -> int:
@@ -51,7 +49,7 @@ def zarr_bytes(url: str) -> int:
         item, _ = _image_array(_opened(url), None, url)
     except (ImageFileError, ImportError):
         return 0
-    return 0 if isinstance(item, str) else int(item.nbytes)
+    return int(item.nbytes)
 
 
 def _opened(url: str) -> Any:
@@ -70,49 +68,29 @@ def _opened(url: str) -> Any:
 
 
 def _image_array(opened: Any, array: str | None, url: str) -> tuple[Any, Any]:
-    """(array with the images, the group it lies in or None), or a sentence in its place."""
+    """The array with the images, and the group it lies in if there is one."""
     import zarr
 
     if isinstance(opened, zarr.Array):
-        if array is None:
-            return opened, None
-        return f"the Zarr store is one array, there is no {array} in it", None
+        if array is not None:
+            raise ImageFileError(f"the Zarr store is one array, there is no {array} in it")
+        return opened, None
     arrays = {f"/{k}": v for k, v in opened.members(None) if isinstance(v, zarr.Array)}
-    fitting = {name: v for name, v in arrays.items() if _can_be_images(v)}
-    for dimensions in (3, 2):  # stacks before single images, as in HDF5 files
-        names = [name for name, v in fitting.items() if v.ndim == dimensions]
-        if names:
-            break
-    listed = ", ".join(sorted(names)) or "no images"
-    if array is not None:
-        if f"/{array.strip('/')}" not in arrays:
-            return f"there is no array {array} in the Zarr store; it holds {listed}", None
-        name = f"/{array.strip('/')}"
-    elif len(names) == 1:
-        name = names[0]
-    elif names:
-        example = f"{url.rstrip('/').rpartition('/')[2]}:{sorted(names)[0]}"
-        return (
-            f"the Zarr store holds several arrays that can be images ({listed}); choose one, "
-            f"as in {example}"
-        ), None
-    else:
-        return (
-            "the Zarr store holds no image stack; an array of shape (frames, height, width) "
-            "is needed"
-        ), None
+    name = choose_images(
+        {k: v.ndim if np.dtype(v.dtype).kind in "uif" else 0 for k, v in sorted(arrays.items())},
+        array,
+        file_name=url.rstrip("/").rpartition("/")[2],
+        kind="Zarr store",
+        part="array",
+    )
     parent = name.rpartition("/")[0].strip("/")
     return arrays[name], opened[parent] if parent else opened
 
 
-def _can_be_images(array: Any) -> bool:
-    return array.ndim in (2, 3) and np.dtype(array.dtype).kind in "uif"
-
-
-def _times(group: Any, count: int) -> NDArray[np.float64] | None:
-    """Times of the frames, if they lie beside the images."""
-    for name in _TIMES if group is not None else ():
-        if name in group and getattr(group[name], "shape", None) == (count,):
+def _times(group: Any) -> NDArray[np.float64] | None:
+    """Times stored beside the images."""
+    for name in TIME_NAMES if group is not None else ():
+        if name in group and getattr(group[name], "ndim", None) == 1:
             return np.asarray(group[name][:], dtype=np.float64)
     return None
 
