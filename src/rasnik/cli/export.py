@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from rasnik.cli import export_seismic as seismic
 from rasnik.cli.common import fail, messages
+from rasnik.cli.export_seismic import SeismicOptions, export_seismic
 
 __all__ = ["export_command"]
 
@@ -18,14 +20,26 @@ def export_command(
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="File to write: .csv, .parquet or .h5."
+            "--output", "-o", metavar="FILE", help="File to write: .csv, .parquet, .h5 or .mseed."
         ),
     ],
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a file that is there already.")
     ] = False,
+    network: seismic.NetworkOption = "XX",
+    station: seismic.StationOption = None,
+    location: seismic.LocationOption = "",
+    channels: seismic.ChannelOption = None,
+    suspension: seismic.SuspensionOption = None,
+    frequency: seismic.FrequencyOption = None,
+    q: seismic.QOption = None,
+    stationxml: seismic.StationXmlOption = None,
+    place: seismic.PlaceOption = None,
+    count_nm: seismic.CountOption = None,
+    start: seismic.StartOption = None,
+    exposure: seismic.ExposureOption = None,
 ) -> None:
-    """Convert a track to CSV or Parquet.
+    """Convert a track to CSV, Parquet or miniSEED.
 
     A track that is still being measured can be exported as well, as far as it has come.
 
@@ -34,18 +48,34 @@ def export_command(
     rasnik export track.h5 -o track.csv
 
     rasnik export track.h5 -o track.parquet --overwrite
+
+    rasnik export track.h5 -o track.mseed --station RAS1 --frequency 0.5 --q 5
+    --channel x=90 --channel y=0,-90 --stationxml track.xml --place 52.36,4.95
     """
     from rasnik.io import read_track, write_track
+    from rasnik.io.seismic_files import MINISEED_SUFFIXES
 
     if output.exists() and track.exists() and output.samefile(track):
         fail(f"{output} is the track itself; name another file.")
     if output.exists() and not overwrite:
         fail(f"{output} exists already; give another name, or --overwrite to replace it.")
+    options = SeismicOptions(
+        network, station, location, channels, suspension, frequency, q, stationxml, place,
+        count_nm, start, exposure,
+    )  # fmt: skip
+    is_seismic = output.suffix.lower() in MINISEED_SUFFIXES
+    if options.given and not is_seismic:
+        fail(f"{output}: the options of miniSEED need a name in {', '.join(MINISEED_SUFFIXES)}.")
     try:
         rows = read_track(track)
-        write_track(rows, output, overwrite=overwrite)
+        if is_seismic:
+            said = export_seismic(track, rows, output, options, overwrite=overwrite)
+        else:
+            write_track(rows, output, overwrite=overwrite)
+            said = [f"{len(rows)} frames written to {output}"]
     except (ValueError, ImportError) as error:
         fail(f"{str(error).rstrip('.')}.")
     except OSError as error:
         fail(f"{str(error).rstrip('.')}.")
-    messages().print(escape(f"{len(rows)} frames written to {output}"))
+    for sentence in said:
+        messages().print(escape(sentence))

@@ -116,7 +116,7 @@ def write_station_xml(
         unfinished.unlink(missing_ok=True)
 
 
-def counts_per_metre(inventory: Inventory, identifier: str, when: Any = None) -> float:
+def counts_per_metre(inventory: Inventory, identifier: str, when: Any) -> float:
     """Counts of a channel for a metre of the displacement that its sensor hands on.
 
     Parameters
@@ -124,7 +124,8 @@ def counts_per_metre(inventory: Inventory, identifier: str, when: Any = None) ->
     inventory : obspy Inventory
     identifier : str
         ``network.station.location.channel``.
-    when : obspy UTCDateTime, optional
+    when : obspy UTCDateTime
+        Descriptions change with time.
 
     Raises
     ------

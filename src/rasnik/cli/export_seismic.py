@@ -1,0 +1,247 @@
+"""``rasnik export`` to miniSEED and StationXML: its options, and the way to the files."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rasnik.cli.common import fail, numbers
+from rasnik.cli.files import system_for
+
+if TYPE_CHECKING:
+    from rasnik.io.seed_codes import Direction, Site
+    from rasnik.io.seismic_files import SeismicChannel
+    from rasnik.seismic.suspension import Suspension
+    from rasnik.tracking.track import Track
+
+__all__ = ["SeismicOptions", "export_seismic"]
+
+_PANEL = "miniSEED"
+
+NetworkOption = Annotated[
+    str,
+    typer.Option(metavar="CODE", help="SEED network; XX is nobody's.", rich_help_panel=_PANEL),
+]
+StationOption = Annotated[
+    str | None, typer.Option(metavar="CODE", help="SEED station.", rich_help_panel=_PANEL)
+]
+LocationOption = Annotated[
+    str,
+    typer.Option(
+        metavar="CODE", help="SEED location, two characters or none.", rich_help_panel=_PANEL
+    ),
+]
+ChannelOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--channel",
+        metavar="COLUMN[=AZIMUTH[,DIP]]",
+        help="Column and where its axis on the mask points: degrees clockwise from north, degrees "
+        "down. Repeatable; by default x and y, directions unknown.",
+        rich_help_panel=_PANEL,
+    ),
+]
+SuspensionOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE", help="TOML file of the proof mass's suspension.", rich_help_panel=_PANEL
+    ),
+]
+FrequencyOption = Annotated[
+    float | None,
+    typer.Option(
+        "--frequency",
+        metavar="HZ",
+        help="Natural frequency of the proof mass, in place of a file.",
+        rich_help_panel=_PANEL,
+    ),
+]
+QOption = Annotated[
+    float | None,
+    typer.Option("--q", metavar="Q", help="Its quality factor.", rich_help_panel=_PANEL),
+]
+StationXmlOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--stationxml", metavar="FILE", help="Write the response, too.", rich_help_panel=_PANEL
+    ),
+]
+PlaceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--place",
+        metavar="LAT,LON[,ELEVATION[,DEPTH]]",
+        help="Of the station, degrees and metres; StationXML needs it.",
+        rich_help_panel=_PANEL,
+    ),
+]
+CountOption = Annotated[
+    float | None,
+    typer.Option(
+        "--count-nm",
+        metavar="NM",
+        help="Write integers (Steim2) of this step; by default floats in metres.",
+        rich_help_panel=_PANEL,
+    ),
+]
+StartOption = Annotated[
+    str | None,
+    typer.Option(
+        "--start",
+        metavar="TIME",
+        help="UTC time of the first frame, as 2026-11-23T02:10:00, where the track's times do not "
+        "count from 1970.",
+        rich_help_panel=_PANEL,
+    ),
+]
+ExposureOption = Annotated[
+    float | None,
+    typer.Option(
+        "--exposure",
+        metavar="SECONDS",
+        help="Exposure of a frame, for the response; by default that of the track's system.",
+        rich_help_panel=_PANEL,
+    ),
+]
+
+
+@dataclass(frozen=True)
+class SeismicOptions:
+    """What the options said, as they came."""
+
+    network: str
+    station: str | None
+    location: str
+    channels: list[str] | None
+    suspension: Path | None
+    frequency_hz: float | None
+    q: float | None
+    stationxml: Path | None
+    place: str | None
+    count_nm: float | None
+    start: str | None
+    exposure_s: float | None
+
+    @property
+    def given(self) -> bool:
+        """Whether any was given that only miniSEED knows."""
+        plain = SeismicOptions("XX", None, "", None, None, None, None, None, None, None, None, None)
+        return self != plain
+
+
+def export_seismic(
+    path: Path, track: Track, output: Path, options: SeismicOptions, *, overwrite: bool
+) -> list[str]:
+    """Write the files of a track; one sentence for each.
+
+    Raises
+    ------
+    ValueError, OSError, ImportError
+        As the functions that write them.
+    """
+    from rasnik.io.seismic_files import channels_of, write_miniseed
+    from rasnik.io.station_xml import to_inventory, write_station_xml
+
+    xml = options.stationxml
+    if xml is not None and xml.exists() and not overwrite:
+        fail(f"{xml} exists already; give another name, or --overwrite to replace it.")
+    channels = channels_of(
+        track,
+        _site(options),
+        _directions(options.channels),
+        suspension=_suspension(options),
+        start_s=_start_s(options.start),
+        exposure_s=_exposure_s(path, track, options),
+        encoding="FLOAT64" if options.count_nm is None else "STEIM2",
+        count_nm=options.count_nm,
+    )
+    if xml is not None:
+        to_inventory(channels)  # whatever is wrong with it comes out before the first file
+    write_miniseed(channels, output, overwrite=overwrite)
+    said = [f"{_listed(channels)} written to {output}"]
+    if xml is not None:
+        write_station_xml(channels, xml, overwrite=overwrite)
+        said.append(f"response written to {xml}")
+    return said
+
+
+def _listed(channels: list[SeismicChannel]) -> str:
+    names = ", ".join(one.identifier for one in channels)
+    missing = max(one.series.missing for one in channels)
+    frames = f"{len(channels[0].series)} frames at {channels[0].series.rate_hz:g} Hz"
+    return f"{names}: {frames}" + (f", {missing} of them missing," if missing else "")
+
+
+def _site(options: SeismicOptions) -> Site:
+    from rasnik.io.seed_codes import Site
+
+    if options.station is None:
+        fail("miniSEED needs the code of a station: --station.")
+    place: dict[str, Any] = {}
+    if options.place is not None:
+        names = ("latitude_deg", "longitude_deg", "elevation_m", "depth_m")
+        values = numbers(options.place, "--place", "LAT,LON,ELEVATION,DEPTH", least=2)
+        place = dict(zip(names, values, strict=False))
+    elif options.stationxml is not None:
+        fail("StationXML needs the place of the station: --place LAT,LON.")
+    return Site(options.station, options.network, options.location, **place)
+
+
+def _directions(texts: list[str] | None) -> dict[str, Direction | None]:
+    from rasnik.io.seed_codes import Direction
+
+    found: dict[str, Direction | None] = {}
+    for text in texts or ("x", "y"):
+        name, equals, angles = text.partition("=")
+        column = {"x": "x_um", "y": "y_um"}.get(name.strip(), name.strip())
+        if column in found:
+            fail(f"--channel {text}: {column} is given twice.")
+        found[column] = None
+        if equals:
+            option = f"--channel {name}="
+            found[column] = Direction(*numbers(angles, option, "AZIMUTH,DIP", least=1))
+    return found
+
+
+def _suspension(options: SeismicOptions) -> Suspension | None:
+    from pydantic import ValidationError
+
+    from rasnik._config import SystemConfigError, read_toml, sentences
+    from rasnik.seismic.suspension import Suspension
+
+    values: dict[str, Any]
+    if options.suspension is not None:
+        if options.frequency_hz is not None or options.q is not None:
+            fail("--suspension and --frequency, --q exclude each other: the file has both.")
+        label, values = str(options.suspension), read_toml(options.suspension)
+    elif options.frequency_hz is None and options.q is None:
+        return None
+    elif options.frequency_hz is None or options.q is None:
+        fail("--frequency and --q go together: give both, or a --suspension file.")
+    else:
+        label, values = "suspension", {"frequency_hz": options.frequency_hz, "q": options.q}
+    try:
+        return Suspension.model_validate(values)
+    except ValidationError as error:
+        raise SystemConfigError(label, sentences(Suspension, error)) from None
+
+
+def _start_s(text: str | None) -> float | None:
+    if text is None:
+        return None
+    try:
+        when = datetime.fromisoformat(text)
+    except ValueError:
+        fail(f"--start {text!r} is not a time such as 2026-11-23T02:10:00.")
+    return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+
+
+def _exposure_s(path: Path, track: Track, options: SeismicOptions) -> float:
+    if options.exposure_s is not None:
+        return options.exposure_s
+    system = system_for(path, track, [])
+    return 0.0 if system is None else system.sensor.exposure_s or 0.0
