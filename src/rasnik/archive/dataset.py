@@ -1,0 +1,351 @@
+"""The results of an archive: Parquet by instrument and day, and a journal of what is done.
+
+One process writes a dataset at a time, and it alone. The parts of a chunk are written first,
+each under another name and then renamed; then one line is added to the journal. A part that no
+line of the journal names is of a chunk that was not finished: it is removed when the dataset is
+opened again, and the chunk done again. So every image has one row, whatever is killed and when.
+A chunk of which a part is missing or cut off counts as not done either.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from hashlib import blake2b
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+from urllib.parse import quote
+
+from rasnik import __version__
+from rasnik.archive.done import DoneFrames, pack_spans, unpack_spans
+from rasnik.archive.systems_table import InstrumentSettings
+from rasnik.archive.work import Part, Result, Work
+from rasnik.io.file_lock import FileLock
+
+__all__ = ["Dataset", "DatasetError", "Totals", "open_dataset"]
+
+_JOURNAL = "_journal.jsonl"  # readers of Parquet leave out names that begin with _ or .
+_UNFINISHED = "_unfinished-"
+_PART = re.compile(rf"({_UNFINISHED})?part-[0-9a-f]+\.parquet")
+_FORMAT = "rasnik archive 1"
+
+
+class DatasetError(ValueError):
+    """A folder that cannot be, or go on as, this dataset; says why and what to do."""
+
+
+@dataclass(frozen=True)
+class Totals:
+    """How many images of an instrument have rows, and what they took.
+
+    Attributes
+    ----------
+    good, failed : int
+        Images with a position, and without.
+    seconds : float
+        Time of the workers.
+    """
+
+    good: int = 0
+    failed: int = 0
+    seconds: float = 0.0
+
+    @property
+    def images(self) -> int:
+        return self.good + self.failed
+
+    def __add__(self, other: Totals) -> Totals:
+        good, failed = self.good + other.good, self.failed + other.failed
+        return Totals(good, failed, self.seconds + other.seconds)
+
+
+@dataclass(frozen=True)
+class _Line:
+    """What the journal says of one chunk; settings by their key, parts as (day, rows, bytes)."""
+
+    chunk: str
+    instrument: str
+    settings: str
+    good: int
+    failed: int
+    seconds: float
+    parts: tuple[tuple[str, int, int], ...]
+    spans: str
+
+    @property
+    def paths(self) -> dict[str, int]:
+        """Size of each part by its path below the dataset."""
+        return {_part_path(self.instrument, day, self.chunk): size for day, _, size in self.parts}
+
+
+def _values(settings: InstrumentSettings, track: bool) -> str:
+    """All that decides how images of an instrument are analysed, as text."""
+    about = {
+        "system": settings.system.to_toml(),
+        "model": settings.model,
+        "orientation": settings.orientation,
+        "frame rate": settings.frame_rate_hz,
+        "tracking": track,
+    }
+    return json.dumps(about)
+
+
+def _key(values: str) -> str:
+    return blake2b(values.encode(), digest_size=8).hexdigest()
+
+
+class Dataset:
+    """A dataset that is being written.
+
+    Parameters
+    ----------
+    path : Path
+        A folder; made if it is not there.
+
+    Attributes
+    ----------
+    done : DoneFrames
+        What has rows.
+    totals : dict of str to Totals
+        By instrument, of all runs.
+    removed : int
+        Parts of chunks that were not finished, removed on opening.
+
+    Raises
+    ------
+    DatasetError
+        If the folder holds something else, or was written by another version of the package.
+    BlockingIOError
+        If another program writes it.
+    OSError
+        If it cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.done = DoneFrames()
+        self.totals: dict[str, Totals] = {}
+        self._instruments: dict[str, str] = {}  # and the key of their settings
+        self._settings: dict[str, str] = {}  # by key
+        self.removed = 0
+        journal = _prepare(path)
+        self._lock = FileLock(journal)
+        try:
+            self._read(journal)
+            self._journal = journal.open("ab")
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let others write it."""
+        self._journal.close()
+        self._lock.release()
+
+    def _read(self, journal: Path) -> None:
+        """What is done; and clear away what is not."""
+        there = dict(_parts(self.path))
+        whole: set[str] = set()
+        for line in _lines(journal):
+            if isinstance(line, str):
+                self._settings[_key(line)] = line
+                continue
+            paths = line.paths
+            if line.settings in self._settings and all(
+                there.get(path) == size for path, size in paths.items()
+            ):
+                whole.update(paths)
+                self._take(line)
+        for path in there:
+            if path not in whole:
+                (self.path / path).unlink()
+                self.removed += 1
+
+    def _take(self, line: _Line) -> None:
+        """A chunk counts as done."""
+        self.done.add(unpack_spans(line.spans))
+        new = Totals(line.good, line.failed, line.seconds)
+        self.totals[line.instrument] = self.totals.get(line.instrument, Totals()) + new
+        self._instruments[line.instrument] = line.settings
+
+    @property
+    def instruments(self) -> list[str]:
+        """Those that have rows."""
+        return list(self._instruments)
+
+    def differences(self, instrument: str, settings: InstrumentSettings, track: bool) -> list[str]:
+        """Names of settings that its rows were made with other values of; none without rows."""
+        if instrument not in self._instruments:
+            return []
+        before = json.loads(self._settings[self._instruments[instrument]])
+        now = json.loads(_values(settings, track))
+        return [key for key in now if before.get(key) != now[key]]
+
+    def store(self, work: Work, result: Result) -> None:
+        """Write the rows of a chunk, then that it is done."""
+        chunk = work.chunk
+        for part in result.parts:
+            self._write(self.path / _part_path(chunk.instrument, part.day, chunk.name), part)
+        line = _Line(
+            chunk.name,
+            chunk.instrument,
+            self._key_of(_values(work.settings, work.track)),
+            result.good,
+            result.failed,
+            round(result.seconds, 3),
+            tuple((part.day, part.rows, len(part.data)) for part in result.parts),
+            pack_spans(s.done(n) for s, n in zip(chunk.spans, result.found, strict=True)),
+        )
+        self._add_line(asdict(line))
+        self._take(line)
+
+    def _key_of(self, values: str) -> str:
+        """The key of settings, which are written down when they are used first."""
+        key = _key(values)
+        if key not in self._settings:
+            self._add_line({"values": values})
+            self._settings[key] = values
+        return key
+
+    def _add_line(self, content: dict[str, Any]) -> None:
+        self._journal.write(json.dumps(content).encode() + b"\n")
+        self._journal.flush()
+        os.fsync(self._journal.fileno())
+
+    def _write(self, path: Path, part: Part) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = path.with_name(_UNFINISHED + path.name)
+        with unfinished.open("wb") as file:
+            file.write(part.data)
+            file.flush()
+            os.fsync(file.fileno())
+        unfinished.replace(path)
+
+
+# ------------------------------------------------------------------------ files
+
+
+def _prepare(path: Path) -> Path:
+    """The journal of a dataset, which is begun if there is none."""
+    journal = path / _JOURNAL
+    if path.exists() and not path.is_dir():
+        raise DatasetError(f"{path} is a file, not a folder with a dataset; name another")
+    if not journal.exists():
+        if path.exists() and any(path.iterdir()):
+            raise DatasetError(
+                f"{path} holds something else than a dataset of this program; name a new folder"
+            )
+        path.mkdir(parents=True, exist_ok=True)
+    with journal.open("ab+") as file:
+        file.seek(0)
+        head = file.readline()
+        if not head.endswith(b"\n"):  # new, or killed when it was
+            file.truncate(0)
+            file.write(json.dumps({"format": _FORMAT, "software": __version__}).encode() + b"\n")
+            return journal
+        file.seek(-1, os.SEEK_END)
+        if file.read(1) != b"\n":  # a line that was being written
+            file.write(b"\n")
+    _check(path, head)
+    return journal
+
+
+def _check(path: Path, head: bytes) -> None:
+    try:
+        about = json.loads(head)
+        kind, version = about["format"], about["software"]
+    except (ValueError, KeyError, TypeError):
+        kind, version = None, None
+    if kind != _FORMAT:
+        raise DatasetError(f"{path / _JOURNAL} is not the journal of a dataset; name a new folder")
+    if version != __version__:
+        raise DatasetError(
+            f"{path} was begun with rasnik {version}, and this is {__version__}, whose results may "
+            "differ; go on with that version, or name a new folder"
+        )
+
+
+def _lines(journal: Path) -> Iterator[_Line | str]:
+    """Settings, and chunks that are done; a line that a crash has spoilt is left out."""
+    with journal.open("rb") as file:
+        next(file)
+        for text in file:
+            try:
+                values = json.loads(text)
+                if "values" in values:
+                    yield str(values["values"])
+                    continue
+                line = _Line(**{**values, "parts": tuple(map(tuple, values["parts"]))})
+                unpack_spans(line.spans)
+            except (ValueError, TypeError, KeyError):
+                continue
+            yield line
+
+
+def _parts(path: Path) -> Iterator[tuple[str, int]]:
+    """(path below the dataset, bytes) of every part there is, unfinished ones too."""
+    for folder, _, names in os.walk(path):
+        for name in names:
+            file = os.path.join(folder, name)
+            if _PART.fullmatch(name):
+                yield os.path.relpath(file, path), os.stat(file).st_size
+            elif name.endswith(".parquet"):
+                raise DatasetError(
+                    f"{file} was not written by this program, and would be counted with the "
+                    "rest; move it out of the dataset"
+                )
+
+
+def _part_path(instrument: str, day: str, chunk: str) -> str:
+    readable = instrument.encode(errors="backslashreplace")  # names of files need not be text
+    name = quote(readable, safe="")
+    return os.path.join(f"instrument={name}", f"day={day}", f"part-{chunk}.parquet")
+
+
+# ------------------------------------------------------------------------ reading
+
+
+def open_dataset(path: str | os.PathLike[str]) -> Any:
+    """A dataset of an archive as a `pyarrow.dataset.Dataset`.
+
+    Instruments are text, also where their names are numbers.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Raises
+    ------
+    DatasetError
+        If there is none.
+    ImportError
+        If pyarrow is not installed.
+    """
+    try:
+        import pyarrow
+        from pyarrow import dataset
+    except ImportError:
+        raise ImportError(
+            'datasets need pyarrow; install it with: pip install "rasnik[archive]"'
+        ) from None
+    if not (Path(path) / _JOURNAL).exists():
+        raise DatasetError(f"{path} holds no dataset of an archive; check the name")
+    names = pyarrow.schema([(name, pyarrow.string()) for name in ("instrument", "day")])
+    layout = dataset.partitioning(names, flavor="hive")
+    opened = dataset.dataset(str(path), format="parquet", partitioning=layout)
+    return opened.replace_schema(opened.schema.remove_metadata())
