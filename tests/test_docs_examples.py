@@ -55,12 +55,13 @@ def run_bash(block: Block, page: Path) -> str:
     }
     run = subprocess.run(
         ["bash", "-euo", "pipefail", "-c", block.text],
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
         env=environment,
         timeout=120,
     )
-    assert run.returncode == 0, f"{page.name}, line {block.line}: {run.stdout}{run.stderr}"
+    assert run.returncode == 0, f"{page.name}, line {block.line}: {run.stdout}"
     return run.stdout
 
 
