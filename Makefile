@@ -5,13 +5,14 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 SOURCES := $(wildcard src tests benchmarks)
 
 .DELETE_ON_ERROR:
-.PHONY: help demo test lint format bench wheel clean distclean
+.PHONY: help demo test lint format bench docs wheel clean distclean
 
 help:
 	@echo "make demo       simulate a Rasnik, analyse the images, show where the mask was"
 	@echo "make test       run the tests            (ARGS='-k mask' for some of them)"
 	@echo "make lint       ruff and mypy            (make format mends the layout)"
 	@echo "make bench      run the benchmarks"
+	@echo "make docs       the pages as a site, in site/"
 	@echo "make wheel      build the package and try it"
 	@echo "make clean      remove what was made     (make distclean: the environment too)"
 
@@ -56,6 +57,15 @@ format: .venv/.dev
 
 bench: .venv/.dev .venv/.bench
 	@set -e; for file in $(sort $(wildcard benchmarks/[!_]*.py)); do echo "== $$file"; $(BIN)/python "$$file" $(ARGS); done
+
+.venv/.docs: pyproject.toml | $(BIN)/python
+	$(PIP) install --editable '.[docs]'
+	@touch $@
+
+# Warnings are errors; the variable spares the build advertisements.
+docs: .venv/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+	@echo "open site/index.html"
 
 # What is shipped must work without the checkout: systems and type marker included.
 wheel: .venv/.dev
