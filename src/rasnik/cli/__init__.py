@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from rasnik.cli.align import align_command
 from rasnik.cli.analyse import analyse_command
 from rasnik.cli.budget import budget_command
 from rasnik.cli.demo import demo_command
@@ -73,4 +74,5 @@ app.command("resolution")(resolution_command)
 app.command("linearity")(linearity_command)
 app.command("paper")(paper_command)
 app.command("spectrum")(spectrum_command)
+app.command("align")(align_command)
 app.command("doctor")(doctor_command)
