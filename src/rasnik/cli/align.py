@@ -13,7 +13,7 @@ from rasnik.cli.common import fail, messages, output
 from rasnik.cli.files import PlotOption, check_outputs, written
 
 if TYPE_CHECKING:
-        from rasnik.geometry.installation import Installation
+    from rasnik.geometry.installation import Installation
     from rasnik.geometry.network import Network
     from rasnik.geometry.observations import Readings
     from rasnik.geometry.solution import Adjustment, Check

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from rasnik.geometry.solution import Adjustment
+from rasnik.report.numbers import rounded, with_sigma
 
 __all__ = ["installation_figure", "plot_installation"]
 
@@ -182,56 +183,51 @@ def _short(dof: int) -> str:
 def _draw_motions(
     axes: Any, found: Adjustment, dofs: slice, unit: str, factor: float, has_data: bool
 ) -> None:
-    """Motions with error bars, or errors alone, of every body."""
-    network, sigmas = found.network, found.sigmas
-    labels, places = [], []
-    for b, name in enumerate(network.bodies):
+    """Motions with error bars, or errors alone, of every body and of the sagittas."""
+    rows: list[tuple[str, float, float, str]] = []
+    for b, name in enumerate(found.network.bodies):
         for d in range(*dofs.indices(6)):
             if found.free[b, d]:
-                places.append((b, d))
-                labels.append(f"{name} {_short(d)}")
-    rows = np.arange(len(places))
-    for row, (b, d) in zip(rows, places, strict=True):
-        if not found.measured[b, d]:
-            axes.axhspan(row - 0.4, row + 0.4, color=_UNMEASURED, alpha=0.25, linewidth=0)
-            axes.annotate(
-                "unmeasured", (0.5, row), xycoords=("axes fraction", "data"), ha="center",
-                va="center", fontsize=8, color="#7a6210",
-            )  # fmt: skip
-            continue
-        value = found.motions[b, d] * factor if has_data else 0.0
-        style = {"fmt": "o" if has_data else "none", "capsize": 4, "color": _AFTER}
-        axes.errorbar(value, row, xerr=sigmas[b, d] * factor, **style)
-        told = f"± {sigmas[b, d] * factor:.2g}"
-        axes.annotate(
-            told if not has_data else f"{value:.4g} {told}", (0.985, row),
-            xycoords=("axes fraction", "data"), ha="right", va="center", fontsize=7,
-            color="#555555",
-        )  # fmt: skip
-    if has_data and dofs.start == 0:
-        _add_sagittas(axes, found, labels)
-        rows = np.arange(len(labels))
-    axes.axvline(0, color="black", linewidth=0.8)
-    axes.set_yticks(rows, labels, fontsize=8)
-    axes.set_ylim(len(labels) - 0.5, -0.5)
-    low, high = axes.get_xlim()
-    axes.set_xlim(low, high + 0.35 * (high - low))  # room for the numbers
+                sigma = found.sigmas[b, d] * factor
+                rows.append((f"{name} {_short(d)}", found.motions[b, d] * factor, sigma, "o"))
+    if dofs.start == 0:
+        for one in found.sagittas:
+            for axis, value, sigma in zip(one.axes, one.value_um, one.sigma_um, strict=True):
+                rows.append((f"sagitta {one.name} {axis}", value, sigma, "D"))
+    for row, (_, value, sigma, marker) in enumerate(rows):
+        _draw_row(axes, row, value, sigma, marker, has_data)
+    axes.set_yticks(range(len(rows)), [label for label, *_ in rows], fontsize=8)
+    axes.set_ylim(len(rows) - 0.5, -0.5)
+    if has_data:
+        axes.axvline(0, color="black", linewidth=0.8)
+        low, high = axes.get_xlim()
+        axes.set_xlim(low, high + 0.4 * (high - low))  # room for the numbers
+    elif np.isfinite([sigma for _, _, sigma, _ in rows]).any():
+        axes.set_xscale("log")
+        low, high = axes.get_xlim()
+        axes.set_xlim(low / 2, high * (high / low) ** 0.3 * 2)
     what = "translation" if dofs.start == 0 else "rotation"
-    meaning = f"{what} ± 1 standard deviation" if has_data else f"standard deviation of a {what}"
+    meaning = f"{what} ± 1 standard deviation" if has_data else f"standard deviation of {what}"
     axes.set_xlabel(f"{meaning} ({unit})")
     axes.grid(axis="x", color="#eeeeee")
     axes.set_axisbelow(True)
 
 
-def _add_sagittas(axes: Any, found: Adjustment, labels: list[str]) -> None:
-    for one in found.sagittas:
-        for axis, value, sigma in zip(one.axes, one.value_um, one.sigma_um, strict=True):
-            if not np.isfinite(sigma):
-                continue
-            row = len(labels)
-            labels.append(f"sagitta {one.name} {axis}")
-            axes.errorbar(value, row, xerr=sigma, fmt="D", capsize=4, color=_LIGHT)
-            axes.annotate(
-                f"{value:.4g} ± {sigma:.2g}", (0.985, row), xycoords=("axes fraction", "data"),
-                ha="right", va="center", fontsize=7, color="#555555",
-            )  # fmt: skip
+def _draw_row(axes: Any, row: int, value: float, sigma: float, marker: str, has_data: bool) -> None:
+    if not np.isfinite(sigma):
+        axes.axhspan(row - 0.4, row + 0.4, color=_UNMEASURED, alpha=0.25, linewidth=0)
+        axes.annotate(
+            "unmeasured", (0.5, row), xycoords=("axes fraction", "data"), ha="center",
+            va="center", fontsize=8, color="#7a6210",
+        )  # fmt: skip
+        return
+    colour = _AFTER if marker == "o" else _LIGHT
+    if has_data:
+        axes.errorbar(value, row, xerr=sigma, fmt=marker, capsize=4, color=colour, markersize=5)
+    else:
+        axes.plot(sigma, row, marker, color=colour)
+    told = with_sigma(value, sigma) if has_data else f"± {rounded(sigma, sigma)}"
+    axes.annotate(
+        told, (0.985, row), xycoords=("axes fraction", "data"), ha="right", va="center",
+        fontsize=7.5, color="#444444",
+    )  # fmt: skip
