@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TextIO
 from rich.markup import escape
 
 from rasnik.cli.common import fail, messages, output
-from rasnik.io.analysed import AnalysisOptions, analysed
+from rasnik.io.analysed import AnalysisOptions, analysed, frame_name
 from rasnik.io.images import Frame, Source, count_frames, expand_paths, iter_frames
 
 if TYPE_CHECKING:
@@ -159,9 +159,8 @@ def _write(
     own_error = None if pose is not None else error
     try:
         if isinstance(writer, LwdaqWriter):
-            name = f"{frame.file}[{frame.frame}]" if frame.frame else frame.file
             shape = frame.image.shape if frame.image is not None else (0, 0)
-            writer.write(name, pose, shape, error or "")
+            writer.write(frame_name(frame), pose, shape, error or "")
         else:
             notes = frame.notes
             writer.write(make_record(frame.file, frame.frame, pose, error=own_error, notes=notes))

@@ -10,17 +10,28 @@ from rich.markup import escape
 
 from rasnik.cli import export_seismic as seismic
 from rasnik.cli.common import fail, messages
+from rasnik.cli.export_results import export_icaras, export_results, track_or_results
 from rasnik.cli.export_seismic import SeismicOptions, export_seismic
 
 __all__ = ["export_command"]
 
 
 def export_command(
-    track: Annotated[Path, typer.Argument(help="A track, as rasnik track writes it.")],
+    track: Annotated[
+        Path,
+        typer.Argument(
+            help="A track, as rasnik track writes it; or results, as rasnik analyse does, or "
+            "LWDAQ (.txt)."
+        ),
+    ],
     output: Annotated[
         Path,
         typer.Option(
-            "--output", "-o", metavar="FILE", help="File to write: .csv, .parquet, .h5 or .mseed."
+            "--output",
+            "-o",
+            metavar="FILE",
+            help="File to write: .csv, .parquet, .h5, .icaras; of a track .mseed, of results "
+            ".jsonl.",
         ),
     ],
     overwrite: Annotated[
@@ -39,7 +50,7 @@ def export_command(
     start: seismic.StartOption = None,
     exposure: seismic.ExposureOption = None,
 ) -> None:
-    """Convert a track to CSV, Parquet or miniSEED.
+    """Convert a track to CSV, Parquet, miniSEED or lines of ICARAS; or results of images.
 
     A track that is still being measured can be exported as well, as far as it has come.
 
@@ -51,9 +62,12 @@ def export_command(
 
     rasnik export track.h5 -o track.mseed --station RAS1 --frequency 0.5 --q 5
     --channel x=90 --channel y=0,-90 --stationxml track.xml --place 52.36,4.95
+
+    rasnik export lwdaq_results.txt -o results.parquet
     """
-    from rasnik.io import read_track, write_track
+    from rasnik.io import write_track
     from rasnik.io.seismic_files import MINISEED_SUFFIXES
+    from rasnik.tracking.track import Track
 
     if output.exists() and track.exists() and output.samefile(track):
         fail(f"{output} is the track itself; name another file.")
@@ -67,8 +81,14 @@ def export_command(
     if options.given and not is_seismic:
         fail(f"{output}: the options of miniSEED need a name in {', '.join(MINISEED_SUFFIXES)}.")
     try:
-        rows = read_track(track)
-        if is_seismic:
+        rows = track_or_results(track)
+        if not isinstance(rows, Track):
+            if is_seismic:
+                fail(f"{track} holds results of images; miniSEED is made of a track.")
+            said = [export_results(rows, output)]
+        elif output.suffix.lower() == ".icaras":
+            said = [export_icaras(rows, track, output)]
+        elif is_seismic:
             said = export_seismic(track, rows, output, options, overwrite=overwrite)
         else:
             write_track(rows, output, overwrite=overwrite)

@@ -12,7 +12,8 @@ from rich.markup import escape
 from rasnik.cli.common import fail, load, messages, numbers
 
 if TYPE_CHECKING:
-    from rasnik.imaging.simulate import Simulation
+    from rasnik.imaging.simulate import Simulation, Truth
+    from rasnik.instrument import System
 
 __all__ = ["ImageFormat", "simulate_command"]
 
@@ -24,6 +25,7 @@ class ImageFormat(StrEnum):
     TIFF = "tiff"
     NPY = "npy"
     H5 = "h5"
+    LWDAQ = "lwdaq"
 
 
 class PathName(StrEnum):
@@ -98,7 +100,8 @@ def simulate_command(
         ImageFormat | None,
         typer.Option(
             "--format",
-            help="Format of the images: png unless the name of the output tells. h5 is one file.",
+            help="Format of the images: png unless the name of the output tells. h5 is one file, "
+            "lwdaq PNG with the header of LWDAQ in row 0.",
             show_default=False,
         ),
     ] = None,
@@ -195,12 +198,16 @@ def _write_folder(folder: Path, simulation: Simulation, image_format: ImageForma
     if image_format is ImageFormat.PNG and simulation.dtype.kind == "f":
         fail("png cannot hold levels that are not rounded; use --format npy, tiff or h5.")
     digits = max(4, len(str(len(simulation) - 1)))
-    names = [f"frame_{k:0{digits}d}.{image_format.value}" for k in range(len(simulation))]
+    ending = "png" if image_format is ImageFormat.LWDAQ else image_format.value
+    names = [f"frame_{k:0{digits}d}.{ending}" for k in range(len(simulation))]
     _prepare(folder, names)
-    for name, (frame, _) in zip(names, simulation, strict=True):
-        _save(folder / name, frame)
-    truth = truth_as_json(simulation, names)
-    (folder / "truth.json").write_text(truth, encoding="utf-8")
+    for name, (frame, truth) in zip(names, simulation, strict=True):
+        if image_format is ImageFormat.LWDAQ:
+            _save_for_lwdaq(folder / name, frame, truth, simulation.system)
+        else:
+            _save(folder / name, frame)
+    text = truth_as_json(simulation, names)
+    (folder / "truth.json").write_text(text, encoding="utf-8")
     (folder / "system.toml").write_text(simulation.system.to_toml(), encoding="utf-8")
     messages().print(
         f"{len(names)} images, truth.json and system.toml written to {escape(str(folder))}"
@@ -219,6 +226,31 @@ def _prepare(folder: Path, names: list[str]) -> None:
             f"{folder} holds images of another simulation ({stale[0]}); "
             "name another folder or empty this one."
         )
+
+
+def _save_for_lwdaq(path: Path, frame: Any, truth: Truth, system: System) -> None:
+    """The header's text is the truth, as a result of LWDAQ."""
+    import numpy as np
+
+    from rasnik.analysis.pose import Pose
+    from rasnik.io.lwdaq import write_lwdaq_image
+    from rasnik.io.lwdaq_results import LwdaqResult
+
+    pose = Pose(
+        ok=True,
+        x_um=truth.x_um,
+        y_um=truth.y_um,
+        scale=truth.scale,
+        theta_rad=truth.theta_rad,
+        orientation=truth.orientation,
+        covariance=np.zeros((4, 4)),
+    )
+    sizes = {"square_um": system.mask.field_um, "pixel_um": system.pitch_um}
+    try:
+        text = LwdaqResult.from_pose(pose, shape=system.shape, **sizes).text()
+        write_lwdaq_image(path, frame, text=text)
+    except ValueError as error:
+        fail(f"{path}: {error}.")
 
 
 def _save(path: Path, frame: Any) -> None:

@@ -21,8 +21,9 @@ not read.
   ``docs/result-files.md``).
 * What is not known or not measured is ``nan``; fields without use are 0, as the page says.
 * ``grab_time`` has microseconds; date and time are empty where they are not known.
-* ``rasnik_id`` is the file of the image with its frame in brackets, or as given. A comma in it
-  is written ``%2C``, a percent sign ``%25``.
+* ``rasnik_id`` is the file of the image with its frame in brackets, or, of a track, its source;
+  ``seq_no`` counts the images, or is the frame of the track. A comma is written ``%2C``, a
+  percent sign ``%25``.
 * ``icaras_version`` is ``rasnik``, ``analysis_version`` the version of this package.
 * Orientation, flags that are not fatal, blur, contrast and chi-square have no field.
 """
@@ -178,11 +179,11 @@ class IcarasWriter(LineFile, ResultWriter):
         """
         check_record(record)
         ok = record.get("ok") in (True, "true")
-        file, frame = record.get("file") or "", int(record.get("frame") or 0)
+        image = f"{record.get('file') or ''}[{record.get('frame') or 0}]"
         reading = IcarasReading(
             sequence=self._sequence,
             time=time,
-            rasnik_id=(f"{file}[{frame}]" if frame else file) if rasnik_id is None else rasnik_id,
+            rasnik_id=image if rasnik_id is None else rasnik_id,
             channel_id=self._channel_id,
             ierr=_error_number(ok, flag_value(record.get("flags"))),
             values={c: v for c, v in record.items() if v is not None} if ok else {},
@@ -352,7 +353,7 @@ def icaras_records(path: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
         known = {name: value for name, value in reading.values.items() if np.isfinite(value)}
         yield {
             "file": named[1] if named else reading.rasnik_id or str(path),
-            "frame": int(named[2]) if named else 0 if reading.rasnik_id else reading.sequence,
+            "frame": int(named[2]) if named else reading.sequence,
             "ok": ok,
             "flags": flags.names,
             "error": None if ok else " ".join(reasons) or "No result.",

@@ -28,7 +28,7 @@ from rasnik.io.formats import (
     Stack,
     open_stack,
 )
-from rasnik.io.lwdaq import lwdaq_bounds
+from rasnik.io.lwdaq import lwdaq_bounds, lwdaq_text
 
 __all__ = ["Frame", "Source", "count_frames", "expand_paths", "iter_frames", "split_dataset"]
 
@@ -201,6 +201,8 @@ def _frame(source: Source, index: int, stack: Stack) -> Frame:
     if bounds is not None:
         left, top, right, bottom = bounds
         notes += (f"LWDAQ header in row 0: bounds {left},{top},{right},{bottom}",)
+        text = lwdaq_text(image)
+        notes += (f"its text: {text}",) if text else ()
     return Frame(
         source.name,
         index,

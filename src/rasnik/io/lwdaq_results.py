@@ -188,8 +188,8 @@ class LwdaqResult:
         scale, theta_rad, orientation = projection.similarity(self.orientation)
         covariance = np.full((4, 4), np.nan)
         covariance[:2, :2] = np.diag([self.error_um**2] * 2)
-        is_similarity = self.magnification_x == self.magnification_y and not self.slant_mrad
-        model = "similarity" if is_similarity else "affine"
+        is_even = math.isclose(self.magnification_x, self.magnification_y, rel_tol=1e-9)
+        model = "similarity" if is_even and abs(self.slant_mrad) < 1e-6 else "affine"
         return Pose(
             ok=True,
             x_um=projection.x_um,
@@ -205,10 +205,11 @@ class LwdaqResult:
 
     def text(self, more_decimals: int = 0) -> str:
         """The numbers as LWDAQ writes them, or with so many decimals more."""
-        return " ".join(
-            f"{getattr(self, name):.{decimals + more_decimals * bool(decimals)}f}"
-            for name, decimals in LWDAQ_FIELDS
-        )
+        words = []
+        for name, decimals in LWDAQ_FIELDS:
+            digits = decimals + more_decimals if decimals else 0
+            words.append(f"{round(getattr(self, name), digits) + 0.0:.{digits}f}")  # no -0.000
+        return " ".join(words)
 
 
 def _rotation_matrix(angle_rad: float) -> NDArray[np.float64]:

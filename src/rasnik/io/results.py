@@ -40,6 +40,7 @@ __all__ = [
     "CsvWriter",
     "JsonLinesWriter",
     "ResultWriter",
+    "as_records",
     "file_metadata",
     "open_results",
     "read_results",
@@ -173,6 +174,11 @@ def open_results(path: str | os.PathLike[str], *, system: System | None = None) 
             from rasnik.io.icaras import IcarasWriter
 
             return IcarasWriter(path)
+        case ".txt":
+            raise ValueError(
+                f"{path}: lines of LWDAQ need the sizes of field, pixel and image, which results "
+                "do not hold; rasnik analyse writes them"
+            )
     raise ValueError(_unknown_suffix(path))
 
 
@@ -283,6 +289,20 @@ def to_arrays(records: Iterable[Record]) -> dict[str, NDArray[Any]]:
             case _:
                 columns[column.name] = _objects(value or None for value in values)
     return columns
+
+
+def as_records(arrays: Mapping[str, NDArray[Any]]) -> Iterator[dict[str, Any]]:
+    """Records from the arrays of `to_arrays`."""
+    for row in zip(*(arrays[column.name] for column in COLUMNS), strict=True):
+        record = {column.name: plain(value) for column, value in zip(COLUMNS, row, strict=True)}
+        notes, candidates = record.pop("notes"), record.pop("candidates")
+        if notes:
+            record["notes"] = notes.split("; ")
+        if candidates:
+            record["candidates"] = [
+                {key: plain(value) for key, value in candidate.items()} for candidate in candidates
+            ]
+        yield record
 
 
 def _candidates(value: str | list[Record] | None) -> list[dict[str, Any]]:
