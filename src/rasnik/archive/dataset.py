@@ -109,7 +109,7 @@ class Dataset:
     Attributes
     ----------
     done : DoneFrames
-        What has rows.
+        What had rows when it was opened.
     totals : dict of str to Totals
         By instrument, of all runs.
     removed : int
@@ -170,23 +170,21 @@ class Dataset:
                 there.get(path) == size for path, size in paths.items()
             ):
                 whole.update(paths)
-                self._take(line)
+                self.done.add(unpack_spans(line.spans))
+                self._count(line)
         for path in there:
             if path not in whole:
                 (self.path / path).unlink()
                 self.removed += 1
 
-    def _take(self, line: _Line) -> None:
-        """A chunk counts as done."""
-        self.done.add(unpack_spans(line.spans))
+    def _count(self, line: _Line) -> None:
         new = Totals(line.good, line.failed, line.seconds)
         self.totals[line.instrument] = self.totals.get(line.instrument, Totals()) + new
         self._instruments[line.instrument] = line.settings
 
-    @property
-    def instruments(self) -> list[str]:
-        """Those that have rows."""
-        return list(self._instruments)
+    def folder_of(self, instrument: str) -> Path:
+        """Where the rows of an instrument are."""
+        return self.path / _folder(instrument)
 
     def differences(self, instrument: str, settings: InstrumentSettings, track: bool) -> list[str]:
         """Names of settings that its rows were made with other values of; none without rows."""
@@ -212,7 +210,7 @@ class Dataset:
             pack_spans(s.done(n) for s, n in zip(chunk.spans, result.found, strict=True)),
         )
         self._add_line(asdict(line))
-        self._take(line)
+        self._count(line)
 
     def _key_of(self, values: str) -> str:
         """The key of settings, which are written down when they are used first."""
@@ -311,10 +309,13 @@ def _parts(path: Path) -> Iterator[tuple[str, int]]:
                 )
 
 
-def _part_path(instrument: str, day: str, chunk: str) -> str:
+def _folder(instrument: str) -> str:
     readable = instrument.encode(errors="backslashreplace")  # names of files need not be text
-    name = quote(readable, safe="")
-    return os.path.join(f"instrument={name}", f"day={day}", f"part-{chunk}.parquet")
+    return f"instrument={quote(readable, safe='')}"
+
+
+def _part_path(instrument: str, day: str, chunk: str) -> str:
+    return os.path.join(_folder(instrument), f"day={day}", f"part-{chunk}.parquet")
 
 
 # ------------------------------------------------------------------------ reading

@@ -6,16 +6,18 @@ in memory does not grow with the archive.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from hashlib import blake2b
+from pathlib import Path
 
 from rasnik.archive.done import DoneFrames, DoneSpan
 from rasnik.archive.sources import Item
-from rasnik.archive.systems_table import InstrumentSettings, MissingSystemError, SystemsTable
+from rasnik.archive.systems_table import InstrumentSettings
+from rasnik.io.folders import is_url
 from rasnik.io.images import Source, count_frames
 
-__all__ = ["Chunk", "Limits", "Planner", "Span"]
+__all__ = ["Chunk", "Limits", "Planner", "Span", "frames_in"]
 
 _NAMED = 20
 
@@ -31,13 +33,16 @@ class Span:
     stop : int or None
         The frame after the last; None: all to the end.
     expected : int
-        Frames that should be there at least, as far as it is known.
+        Frames that should be there, as far as it is known; 0 if it is not.
+    size : float
+        Bytes of the file that hold them.
     """
 
     item: Item
     start: int = 0
     stop: int | None = None
     expected: int = 0
+    size: float = 0.0
 
     def done(self, found: int) -> DoneSpan:
         """What is done once the frames that were found have rows."""
@@ -101,16 +106,17 @@ class Planner:
 
     Parameters
     ----------
-    table : SystemsTable
-        Instruments that it does not name are left out, and listed in `missing`.
+    settings_of : callable
+        Settings of an instrument by its name. Instruments for which it raises ValueError are
+        left out, and listed in `refused`.
     done : DoneFrames
         What has rows already.
     limits : Limits
 
     Attributes
     ----------
-    missing : dict of str to (str, int)
-        Instruments without a system: why, and how many files they have.
+    refused : dict of str to (str, int)
+        Instruments that are left out: why, and how many files they have.
     unchanged : int
         Files that need nothing.
     changed : list of str
@@ -120,12 +126,18 @@ class Planner:
         How many there are.
     """
 
-    def __init__(self, table: SystemsTable, done: DoneFrames, limits: Limits | None = None) -> None:
-        self._table, self._done = table, done
+    def __init__(
+        self,
+        settings_of: Callable[[str], InstrumentSettings],
+        done: DoneFrames,
+        limits: Limits | None = None,
+    ) -> None:
+        self._settings_of, self._done = settings_of, done
         self._limits = limits or Limits()
+        self._frame_bytes: dict[str, int] = {}
         self._open: dict[str, _Open] = {}
         self._waiting = 0
-        self.missing: dict[str, tuple[str, int]] = {}
+        self.refused: dict[str, tuple[str, int]] = {}
         self.unchanged = 0
         self.changed: list[str] = []
         self.n_changed = 0
@@ -133,52 +145,52 @@ class Planner:
     def chunks(self, items: Iterable[Item]) -> Iterator[Chunk]:
         """Chunks of work, in the order of the items."""
         for item in items:
-            settings = self._settings(item)
-            if settings is None:
+            if not self._accepted(item.instrument):
                 continue
-            for span, frames, size in self._pieces(item, settings):
-                yield from self._add(span, frames, size)
+            for span, frames in self._pieces(item):
+                yield from self._add(span, frames)
             while self._waiting > self._limits.waiting:
                 yield self._close(next(iter(self._open)))
         for instrument in list(self._open):
             yield self._close(instrument)
 
-    def _settings(self, item: Item) -> InstrumentSettings | None:
+    def _accepted(self, instrument: str) -> bool:
+        """Whether there are settings for an instrument."""
+        if instrument in self._frame_bytes:
+            return True
+        if instrument in self.refused:
+            sentence, files = self.refused[instrument]
+            self.refused[instrument] = sentence, files + 1
+            return False
         try:
-            return self._table.of(item.instrument)
-        except MissingSystemError as error:
-            sentence, files = self.missing.get(item.instrument, (f"{error}.", 0))
-            self.missing[item.instrument] = sentence, files + 1
-            return None
+            self._frame_bytes[instrument] = _frame_bytes(self._settings_of(instrument))
+        except ValueError as error:
+            self.refused[instrument] = f"{str(error).rstrip('.')}.", 1
+        return instrument in self._frame_bytes
 
-    def _pieces(
-        self, item: Item, settings: InstrumentSettings
-    ) -> Iterator[tuple[Span, int, float]]:
-        """(frames, how many they may be, bytes) of an item, none larger than a chunk may be."""
+    def _pieces(self, item: Item) -> Iterator[tuple[Span, int]]:
+        """Spans of an item, none larger than a chunk may be, and how many frames they may be."""
         gaps, changed = self._done.left(item)
         self.unchanged += not gaps
         if changed:
             self.n_changed += 1
             self.changed += [item.name] if len(self.changed) < _NAMED else []
-        total = 0
-        if gaps and item.size > self._limits.counted:
-            total = count_frames(Source(item.name, item.url, item.dataset))
+        total = frames_in(item) if gaps and item.size > self._limits.counted else 0
         if total > 1:
-            each = item.size / total
-            most = max(1, min(self._limits.frames, int(self._limits.size / each)))
+            most = max(1, min(self._limits.frames, int(self._limits.size * total / item.size)))
             for start, stop in gaps:
                 for span in _cut(item, start, stop, total, most):
-                    yield span, span.expected, each * span.expected
+                    yield span, span.expected
             return
-        frames = max(1, item.size // _frame_bytes(settings))
+        frames = max(1, item.size // self._frame_bytes[item.instrument])
         for start, stop in gaps:
             expected = 0 if stop is None else stop - start
-            yield Span(item, start, stop, expected), expected or frames, float(item.size)
+            yield Span(item, start, stop, expected, float(item.size)), expected or frames
 
-    def _add(self, span: Span, frames: int, size: float) -> Iterator[Chunk]:
-        """Put a piece into its instrument's chunk, which may have to be closed before or after."""
+    def _add(self, span: Span, frames: int) -> Iterator[Chunk]:
+        """Put a span into its instrument's chunk, which may have to be closed before or after."""
         instrument, limits = span.item.instrument, self._limits
-        chunk = self._open.get(instrument)
+        chunk, size = self._open.get(instrument), span.size
         if chunk and (chunk.frames + frames > limits.frames or chunk.size + size > limits.size):
             yield self._close(instrument)
         chunk = self._open.setdefault(instrument, _Open())
@@ -195,6 +207,12 @@ class Planner:
         return Chunk(instrument, tuple(spans))
 
 
+def frames_in(item: Item) -> int:
+    """Number of frames as the file tells it."""
+    url = item.url if is_url(item.url) else None
+    return count_frames(Source(item.name, Path(item.url), item.dataset, url=url))
+
+
 def _frame_bytes(settings: InstrumentSettings) -> int:
     height, width = settings.system.shape
     return height * width * (1 if settings.system.sensor.bit_depth <= 8 else 2)
@@ -202,9 +220,10 @@ def _frame_bytes(settings: InstrumentSettings) -> int:
 
 def _cut(item: Item, start: int, stop: int | None, total: int, most: int) -> Iterator[Span]:
     """The frames of a gap, so many at a time; the last piece goes to the end if the gap does."""
-    end = total if stop is None else stop
+    each, end = item.size / total, total if stop is None else stop
     while end - start > most:
-        yield Span(item, start, start + most, most)
+        yield Span(item, start, start + most, most, most * each)
         start += most
     if stop is None or start < stop:
-        yield Span(item, start, stop, max(0, end - start))
+        rest = max(0, end - start)
+        yield Span(item, start, stop, rest, rest * each)
