@@ -8,6 +8,7 @@ import typer
 
 from rasnik.cli.align import align_command
 from rasnik.cli.analyse import analyse_command
+from rasnik.cli.archive import archive_app
 from rasnik.cli.budget import budget_command
 from rasnik.cli.demo import demo_command
 from rasnik.cli.design import design_command
@@ -76,3 +77,4 @@ app.command("paper")(paper_command)
 app.command("spectrum")(spectrum_command)
 app.command("align")(align_command)
 app.command("doctor")(doctor_command)
+app.add_typer(archive_app, name="archive")
