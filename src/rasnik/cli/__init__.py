@@ -15,6 +15,7 @@ from rasnik.cli.design import design_command
 from rasnik.cli.doctor import doctor_command
 from rasnik.cli.edges import edges_command
 from rasnik.cli.export import export_command
+from rasnik.cli.geometry import geometry_command
 from rasnik.cli.linearity import linearity_command
 from rasnik.cli.live import live_command
 from rasnik.cli.mask import mask_command
@@ -22,6 +23,7 @@ from rasnik.cli.noise import noise_command
 from rasnik.cli.paper import paper_command
 from rasnik.cli.predict import predict_command
 from rasnik.cli.resolution import resolution_command
+from rasnik.cli.seismic import seismic_app
 from rasnik.cli.simulate import simulate_command
 from rasnik.cli.spectrum import spectrum_command
 from rasnik.cli.systems import systems_command
@@ -70,6 +72,7 @@ app.command("predict")(predict_command)
 app.command("budget")(budget_command)
 app.command("noise")(noise_command)
 app.command("design")(design_command)
+app.command("geometry")(geometry_command)
 app.command("edges")(edges_command)
 app.command("resolution")(resolution_command)
 app.command("linearity")(linearity_command)
@@ -78,3 +81,4 @@ app.command("spectrum")(spectrum_command)
 app.command("align")(align_command)
 app.command("doctor")(doctor_command)
 app.add_typer(archive_app, name="archive")
+app.add_typer(seismic_app, name="seismic")

@@ -298,14 +298,14 @@ def self_noise(
         )
         terms.append(Term("thermal", thermal_asd(f_hz, suspension, temperature_k), source))
     squares = sum(pm**2 for _, pm, _ in white)
-    for name, value in (extra or {}).items():
-        if callable(value):
-            terms.append(Term(name, np.broadcast_to(value(f_hz), f_hz.shape), "as given"))
+    for name, given in (extra or {}).items():
+        if callable(given):
+            terms.append(Term(name, np.broadcast_to(given(f_hz), f_hz.shape), "as given"))
             continue
-        if not (math.isfinite(value) and value >= 0):
-            raise ValueError(f"{name} must be a number of pm/sqrt(Hz), 0 or more, not {value}")
-        squares += value**2
-        terms.append(Term(name, reading(value), f"{value:.4g} pm/√Hz of the reading, as given"))
+        if not (math.isfinite(given) and given >= 0):
+            raise ValueError(f"{name} must be a number of pm/sqrt(Hz), 0 or more, not {given}")
+        squares += given**2
+        terms.append(Term(name, reading(given), f"{given:.4g} pm/√Hz of the reading, as given"))
     return SelfNoise(
         system, suspension, axis, float(rate), math.sqrt(squares), temperature_k, f_hz,
         tuple(terms), tuple(not_counted),

@@ -12,7 +12,7 @@ One decay at one frequency does not tell viscous from structural damping.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -313,7 +313,7 @@ def _result(
         *values, covariance, math.sqrt(variance) * size, chi2_ndf, colour, chance, decays,
         (), series,
     )  # fmt: skip
-    return RingDown(**{**vars(found), "remarks": _remarks(found, freedom)})
+    return replace(found, remarks=_remarks(found, freedom))
 
 
 def _bending(
@@ -357,7 +357,7 @@ def _colour(
 
 def _physical(
     p: NDArray[np.float64], level: float, size: float, span_s: float
-) -> tuple[tuple[float, ...], NDArray[np.float64]]:
+) -> tuple[tuple[float, float, float, float, float, float], NDArray[np.float64]]:
     """(f0, 1/Q, A, phi, offset, drift) in the units of the series, and their derivatives."""
     w, g, a, b, offset, drift = (float(value) for value in p)
     w0, amplitude = math.hypot(w, g), math.hypot(a, b)
