@@ -8,11 +8,12 @@ import re
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from rasnik import __version__, load_system
+from rasnik import __version__
 from rasnik.analysis.flags import Flag
 from rasnik.analysis.pose import Pose
 from rasnik.cli import app
@@ -27,6 +28,7 @@ from rasnik.io.icaras import (
     write_icaras,
 )
 from rasnik.io.results import open_results, read_results
+from rasnik.io.stacks import read_truth
 from rasnik.tracking.track import Track
 
 GOOD = Pose(
@@ -67,10 +69,10 @@ def track(rng):
     nothing = {name: np.full(n, np.nan) for name in ("blur_um", "dark_level", "light_level")}
     return Track(
         frame=np.arange(100, 100 + n),
-        time_s=5000.0 + np.arange(n) / 860.0,
+        time_s=NOON.timestamp() + np.arange(n) / 860.0,
         x_um=x_um,
         flags=flags,
-        metadata={"start_time_utc": NOON.isoformat(), "source": "camera 1, hall"},
+        metadata={"source": "camera 1, hall"},
         **columns,
         **sigmas,
         **nothing,
@@ -156,13 +158,26 @@ def test_a_track_comes_back(tmp_path, track):
             np.testing.assert_array_equal(value, expected)
 
 
-def test_a_track_that_does_not_tell_when_it_began_has_no_times(tmp_path, track):
-    bare = Track(**track.as_dict())
-    write_icaras(bare, tmp_path / "a.icaras")
-    readings = list(read_icaras(tmp_path / "a.icaras"))
+def test_times_with_another_zero_are_not_written_unless_it_is_given(tmp_path, track):
+    bare = Track(**track.as_dict() | {"time_s": track.time_s - NOON.timestamp()})
+    path = tmp_path / "a.icaras"
+    write_icaras(bare, path)
+    readings = list(read_icaras(path))
     assert len(readings) == len(track)
     assert all(isinstance(r, IcarasReading) and r.time is None for r in readings)
-    write_icaras(bare[:0], tmp_path / "b.icaras")
+    write_icaras(bare, path, start_s=NOON.timestamp())
+    first, second, *_ = read_icaras(path)
+    assert isinstance(first, IcarasReading)
+    assert isinstance(second, IcarasReading)
+    assert first.time == NOON
+    assert second.time is not None
+    assert (second.time - NOON).total_seconds() == pytest.approx(1 / 860, abs=1.1e-6)
+    with pytest.raises(ValueError, match="counted from 1970 already"):
+        write_icaras(track, path, start_s=NOON.timestamp())
+
+
+def test_a_track_without_frames(tmp_path, track):
+    write_icaras(track[:0], tmp_path / "b.icaras")
     assert (tmp_path / "b.icaras").read_text() == ""
 
 
@@ -256,15 +271,21 @@ def test_files_of_others_are_refused(tmp_path, text, message):
 
 def test_analyse_and_export(tmp_path):
     size = ["--set", "sensor.width_px=320", "--set", "sensor.height_px=240"]
-    run("simulate", "solidras", *size, "-n", 2, "--seed", 1, "-o", tmp_path / "sim")
-    lines, table = tmp_path / "a.icaras", tmp_path / "a.parquet"
-    run("analyse", tmp_path / "sim", "--system", "solidras", *size, "-o", lines)
+    stack, lines, table = (tmp_path / f"a.{suffix}" for suffix in ("h5", "icaras", "parquet"))
+    run("simulate", "solidras", *size, "-n", 2, "--seed", 1, "-o", stack)
+    with h5py.File(stack, "r+") as file:
+        file["time_s"] = NOON.timestamp() + np.array([0.0, 0.5])
+    run("analyse", f"{stack}:/frames", "--system", "solidras", *size, "-o", lines)
+    readings = list(read_icaras(lines))
+    assert [r.time for r in readings] == [NOON, NOON + timedelta(seconds=0.5)]
+    assert readings[1].rasnik_id == f"{stack}:/frames[1]"
     run("export", lines, "-o", table)
-    truth = load_system("solidras")
-    results = read_results(table)
+    results, truth = read_results(table), read_truth(stack).poses
     assert results["ok"].all()
-    assert abs(results["scale"] - truth.optics.scale).max() < 1e-4
-    assert re.search(r"frame_0001\.png\[0\],", lines.read_text())
+    assert results["frame"].tolist() == [0, 1]
+    for column in ("x_um", "y_um"):
+        off = results[column] - [pose[column] for pose in truth]
+        assert (np.abs(off) < 5 * results[f"sigma_{column}"]).all()
 
 
 def test_export_of_a_track(tmp_path, track):
@@ -275,7 +296,8 @@ def test_export_of_a_track(tmp_path, track):
     assert isinstance(first, IcarasReading)
     assert first.rasnik_id == "camera 1, hall"
     assert first.time == NOON
-    write_track(track, tmp_path / "t.csv")
+    bare = Track(**track.as_dict() | {"time_s": np.arange(50) / 860})
+    write_track(bare, tmp_path / "t.csv")
     said = run("export", tmp_path / "t.csv", "-o", tmp_path / "u.icaras").stderr
     assert "without times" in said
 

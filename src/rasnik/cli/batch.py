@@ -154,16 +154,20 @@ def _write(
     error: str | None,
 ) -> None:
     from rasnik.io.columns import make_record
+    from rasnik.io.icaras import IcarasWriter
     from rasnik.io.lwdaq_results import LwdaqWriter
+    from rasnik.io.utc import utc_time
 
     own_error = None if pose is not None else error
+    record = make_record(frame.file, frame.frame, pose, error=own_error, notes=frame.notes)
     try:
         if isinstance(writer, LwdaqWriter):
             shape = frame.image.shape if frame.image is not None else (0, 0)
             writer.write(frame_name(frame), pose, shape, error or "")
+        elif isinstance(writer, IcarasWriter):
+            writer.write(record, time=utc_time(frame.time_s))
         else:
-            notes = frame.notes
-            writer.write(make_record(frame.file, frame.frame, pose, error=own_error, notes=notes))
+            writer.write(record)
     except BrokenPipeError:  # whoever read the output has seen enough
         raise
     except OSError as fault:

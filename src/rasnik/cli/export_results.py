@@ -51,9 +51,10 @@ def export_results(results: Results, output: Path) -> str:
 def export_icaras(track: Track, source: Path, output: Path) -> str:
     """Write a track as lines of ICARAS; says what was done."""
     from rasnik.io.icaras import write_icaras
+    from rasnik.io.utc import EARLIEST_S
 
     write_icaras(track, output, rasnik_id=track.metadata.get("source") or source.stem)
     said = f"{len(track)} frames written to {output}"
-    if not track.metadata.get("start_time_utc"):
-        said += "; without times, for the track does not tell when it began"
+    if len(track) and not track.time_s[0] >= EARLIEST_S:
+        said += "; without times, for those of the track are not counted from 1970"
     return said

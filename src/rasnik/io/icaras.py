@@ -30,12 +30,11 @@ not read.
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TextIO
 from urllib.parse import unquote
@@ -47,6 +46,7 @@ from rasnik.analysis.flags import FLAGS, Flag
 from rasnik.io.columns import check_record, flag_value
 from rasnik.io.line_file import LineFile
 from rasnik.io.results import Record, ResultWriter
+from rasnik.io.utc import EARLIEST_S, utc_time
 from rasnik.tracking.track import Track
 
 __all__ = [
@@ -193,58 +193,61 @@ class IcarasWriter(LineFile, ResultWriter):
 
 
 def write_icaras(
-    track: Track, path: str | os.PathLike[str], *, rasnik_id: str = "", channel_id: str = ""
+    track: Track,
+    path: str | os.PathLike[str],
+    *,
+    rasnik_id: str = "",
+    channel_id: str = "",
+    start_s: float | None = None,
 ) -> None:
     """Write a track as lines of ICARAS.
-
-    Times are those of the track after ``start_time_utc``, which is the time of its first frame;
-    unknown if its metadata do not tell it.
 
     Parameters
     ----------
     track : Track
-        The numbers of its frames become the sequence numbers.
+        The numbers of its frames become the sequence numbers. Times are written if they are in
+        seconds since 1970 UTC, or `start_s` is given.
     path : path-like
         An existing file is replaced.
     rasnik_id, channel_id : str
         Stand in every stamp.
+    start_s : float, optional
+        When the first frame was taken, in seconds since 1970 UTC; for a track whose times have
+        another zero.
+
+    Raises
+    ------
+    ValueError
+        If `start_s` is given, and the times are counted from 1970 already.
+    OSError
+        If the file cannot be written.
     """
-    start = _start_time(track)
-    after_s = track.time_s - track.time_s[0] if len(track) else track.time_s
+    time_s = track.time_s
+    if start_s is not None and len(track):
+        if time_s[0] >= EARLIEST_S:
+            raise ValueError(
+                "the times of the track are counted from 1970 already; another time of its first "
+                "frame would contradict them"
+            )
+        time_s = start_s + (time_s - time_s[0])
     columns = [name for f in ICARAS_FIELDS for name in (f.column, f.sigma) if name]
     with LineFile(path) as file:
         for first in range(0, len(track), _ROWS_AT_A_TIME):
             piece = slice(first, first + _ROWS_AT_A_TIME)
-            part, times_s = track[piece], after_s[piece]
+            part, ok, times = track[piece], track.ok[piece], time_s[piece].tolist()
             rows = zip(*(getattr(part, name).tolist() for name in columns), strict=True)
-            file.put(
-                "".join(
-                    IcarasReading(
-                        sequence=int(part.frame[k]),
-                        time=_time_of(start, float(times_s[k])),
-                        rasnik_id=rasnik_id,
-                        channel_id=channel_id,
-                        ierr=_error_number(bool(part.ok[k]), Flag(int(part.flags[k]))),
-                        values=dict(zip(columns, row, strict=True)) if part.ok[k] else {},
-                    ).lines()
-                    for k, row in enumerate(rows)
+            readings = (
+                IcarasReading(
+                    sequence=int(part.frame[k]),
+                    time=utc_time(times[k]),
+                    rasnik_id=rasnik_id,
+                    channel_id=channel_id,
+                    ierr=_error_number(bool(ok[k]), Flag(int(part.flags[k]))),
+                    values=dict(zip(columns, row, strict=True)) if ok[k] else {},
                 )
+                for k, row in enumerate(rows)
             )
-
-
-def _start_time(track: Track) -> datetime | None:
-    text = track.metadata.get("start_time_utc")
-    try:
-        start = datetime.fromisoformat(text) if text else None
-    except ValueError:
-        return None
-    return start.replace(tzinfo=start.tzinfo or UTC) if start else None
-
-
-def _time_of(start: datetime | None, after_s: float) -> datetime | None:
-    if start is None or not math.isfinite(after_s):
-        return None
-    return start + timedelta(seconds=after_s)
+            file.put("".join(reading.lines() for reading in readings))
 
 
 # ------------------------------------------------------------------------ reading
