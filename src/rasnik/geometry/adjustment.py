@@ -27,6 +27,9 @@ Array = NDArray[np.float64]
 # Of the last step in standard deviations; beyond it the solution still moves.
 _CONVERGED = 1e-3
 _POLISHING_STEPS = 3
+_TOLERANCE = 1e-6
+# Misfit of a trial that is to be turned down, in standard deviations.
+_INTERRUPTED = 1e100
 # A posterior error within this factor of the prior comes from the prior.
 _FROM_PRIOR = 0.99
 
@@ -58,8 +61,7 @@ def adjust(
     Raises
     ------
     ValueError
-        If no reading can be used, or the bodies would have to move so far that a light path is
-        interrupted.
+        If no reading can be used.
 
     Notes
     -----
@@ -198,17 +200,28 @@ class _Fit:
 
         if not len(self.ranges):
             return
-        tolerance = 4 * np.finfo(float).eps
         found = least_squares(
-            self.misfits, self.parameters, self.slopes, method="lm",
-            ftol=tolerance, xtol=tolerance, gtol=tolerance,
+            self._tried, self.parameters, self.slopes, method="lm",
+            ftol=_TOLERANCE, xtol=_TOLERANCE, gtol=_TOLERANCE,
         )  # fmt: skip
-        self.parameters = found.x
-        for _ in range(_POLISHING_STEPS):  # the last digits, which a sum of squares cannot see
-            slopes = self.slopes(self.parameters)
-            step = np.linalg.lstsq(slopes, -self.misfits(self.parameters))[0]
-            self.parameters = self.parameters + step
+        self.parameters, self.converged = found.x, False
+        try:
+            for _ in range(_POLISHING_STEPS):  # the last digits, which a sum of squares hides
+                slopes = self.slopes(self.parameters)
+                step = np.linalg.lstsq(slopes, -self.misfits(self.parameters))[0]
+                self.misfits(self.parameters + step)
+                self.parameters = self.parameters + step
+        except ValueError:  # the step interrupts a light path
+            return
         self.converged = bool(np.linalg.norm(slopes @ step) < _CONVERGED)
+
+    def _tried(self, parameters: Array) -> Array:
+        """`misfits` of a trial; enormous if a light path is interrupted."""
+        try:
+            return self.misfits(parameters)
+        except ValueError:
+            rows = self.n_readings + len(self.priors) + self.space.shape[1]
+            return np.full(rows, _INTERRUPTED)
 
     def covariance(self) -> Array:
         """Of the free degrees of freedom, in um and rad."""

@@ -332,7 +332,7 @@ def _read(source: str | PathLike[str]) -> tuple[str, dict[str, Any]]:
     """(label for messages, raw content) of a shipped installation or of a file."""
     text, names = str(source), installation_names()
     if not isinstance(source, str) or text.endswith(".toml") or {"/", "\\"} & set(text):
-        return text, read_toml(Path(source))
+        return text, _beside(Path(source), read_toml(Path(source)))
     wanted = text.strip().lower().replace("_", "-")
     if wanted in names:
         shipped = resources.files("rasnik") / "installations" / f"{wanted}.toml"
@@ -344,6 +344,16 @@ def _read(source: str | PathLike[str]) -> tuple[str, dict[str, Any]]:
         "a file is given by a path that ends in .toml"
     )
     raise SystemConfigError(repr(text), [problem])
+
+
+def _beside(path: Path, data: dict[str, Any]) -> dict[str, Any]:
+    """The description with files of systems looked for beside the file that names them."""
+    listed = data.get("rasniks")
+    for entry in [data.get("defaults"), *(listed if isinstance(listed, list) else ())]:
+        system = entry.get("system") if isinstance(entry, dict) else None
+        if isinstance(system, str) and system.endswith(".toml"):
+            entry["system"] = str(path.parent / system)
+    return data
 
 
 def _without_faulty(data: dict[str, Any], left_out: list[str]) -> dict[str, Any]:

@@ -148,9 +148,7 @@ def _groups(network: Network, used: NDArray[np.bool_]) -> list[list[int]]:
     start, end = carriers[:, [0, 0]].ravel(), carriers[:, 1:].ravel()
     graph = coo_matrix((np.ones(len(start)), (start, end)), shape=(count, count))
     _, labels = connected_components(graph, directed=False)
-    groups = [np.flatnonzero(labels == k).tolist() for k in np.unique(labels)]
-    everything = list(range(count))
-    return groups if everything in groups else [everything, *groups]
+    return [np.flatnonzero(labels == k).tolist() for k in np.unique(labels)]
 
 
 def _title(network: Network, group: list[int]) -> str:

@@ -48,8 +48,9 @@ def installation_figure(found: Adjustment) -> Figure:
     elements = found.network.elements_mm(np.zeros_like(shown))
     extent = max(float(np.ptp(elements.reshape(-1, 3), axis=0).max()), 1e-9)
     factor = _exaggeration(shown, extent)
-    for axes, plane in zip(views[:, 0], ((2, 0), (2, 1)), strict=True):
-        _draw_view(axes, found, shown, plane, factor, extent)
+    long = int(np.argmax(np.ptp(elements.reshape(-1, 3), axis=0)))
+    for axes, up in zip(views[:, 0], [k for k in range(3) if k != long], strict=True):
+        _draw_view(axes, found, shown, (long, up), factor, extent)
     has_data = bool(np.isfinite(found.motions).any() and np.isfinite(found.chi2))
     _draw_motions(views[0, 1], found, slice(0, 3), "µm", 1.0, has_data)
     _draw_motions(views[1, 1], found, slice(3, 6), "µrad", 1e6, has_data)
@@ -128,7 +129,7 @@ def _draw_view(
     axes.set_xlabel(f"{'xyz'[plane[0]]} (mm)")
     axes.set_ylabel(f"{'xyz'[plane[1]]} (mm)")
     axes.set_title(f"seen along {'xyz'[3 - plane[0] - plane[1]]}", fontsize=10)
-    axes.margins(0.08)
+    axes.margins(x=0.16)  # room for the names
     axes.grid(color="#eeeeee")
     axes.set_axisbelow(True)
 
