@@ -136,7 +136,7 @@ class Air:
         2e-8 at most between 5 and 50 degrees for dry air of 1000 hPa, as NIST tabulates.
         """
         slopes = [
-            _refractivity(*state, wavelength_nm=self.wavelength_nm).imag / _STEP
+            _refractivity(*state, self.wavelength_nm).imag / _STEP
             for state in _stepped(self._state, 1j * _STEP)
         ]
         return float(np.linalg.norm(slopes * self._sigmas))
@@ -167,13 +167,14 @@ class Air:
         return -density * _GRAVITY
 
 
-def _stepped(state: tuple[float, float, float], step: Any) -> list[list[Any]]:
+def _stepped(state: tuple[float, float, float], step: Any) -> list[tuple[Any, Any, Any]]:
     """The state with a step in its first, second, third number."""
-    return [[one + step * (k == n) for k, one in enumerate(state)] for n in range(3)]
+    t, p, h = state
+    return [(t + step, p, h), (t, p + step, h), (t, p, h + step)]
 
 
 def _well_mixed_slopes(
-    state: tuple[float, float, float] | list[Any], wavelength_nm: float
+    state: tuple[float, float, float], wavelength_nm: float
 ) -> tuple[float, float, float]:
     temperature, pressure, humidity = state
     share = humidity * _saturation_pa(temperature)  # Pa at this pressure
