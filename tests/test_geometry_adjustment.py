@@ -174,7 +174,7 @@ def test_errors_by_monte_carlo(rng: np.random.Generator) -> None:
     motions = np.zeros((3, 6))
     motions[1:] = rng.normal(size=(2, 6)) * [1000, 1000, 1000, 1e-3, 1e-3, 1e-3]
     exact = network.values(motions)
-    n = 100
+    n = 60
     results = [
         adjust(network, readings(exact + sigmas * rng.normal(size=exact.shape))) for _ in range(n)
     ]

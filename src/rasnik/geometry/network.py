@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from rasnik.geometry.installation import Installation
 from rasnik.geometry.mounting import mounting
-from rasnik.geometry.reading import Placement, derivatives, readings
+from rasnik.geometry.reading import Placement, derivatives, projection, readings
 from rasnik.geometry.rigid import UM_PER_MM, left_jacobian, rotation_matrix, skew
+from rasnik.imaging.projection import Projection
 
 __all__ = ["Network"]
 
@@ -82,6 +83,18 @@ class Network:
         found, _ = readings(*self._placements(motions), self.orientation)
         found[:, :2] += self._origin
         return found
+
+    def projection(self, motions: Array, rasnik: int) -> Projection:
+        """The map from sensor to mask of one Rasnik, to simulate its image with."""
+        mask, lens, sensor = self._placements(motions)
+        seen = projection(
+            Placement(mask.position_mm[rasnik], mask.rotation[rasnik]),
+            lens[rasnik],
+            Placement(sensor.position_mm[rasnik], sensor.rotation[rasnik]),
+        )
+        shift = np.eye(3)
+        shift[:2, 2] = self._origin[rasnik]
+        return Projection(shift @ seen.matrix)
 
     def jacobian(self, motions: Array) -> Array:
         """Derivatives of `values`, in closed form.
