@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +23,11 @@ from rasnik.recording.sample import Sample
 SIGMAS = (0.001, 0.002, 1e-6, 1e-6)
 
 
+@cache
+def known_image() -> Any:
+    return rasnik.simulate("solidras", [(4000.0, 5000.0, 0.002)], seed=1).frames[0]
+
+
 class FakeChannel:
     """Moves along a sine of 50 nm in x; y, S and theta_z stay, but for their noise."""
 
@@ -33,8 +39,9 @@ class FakeChannel:
         self.actions: list[Any] = []
         self.alarms: tuple[str, ...] = ()
         self.recording = False
+        self.recorder = SimpleNamespace(folder=folder / name, current=lambda: None)
         self._folder = folder
-        self._image = rasnik.simulate("solidras", [(4000.0, 5000.0, 0.002)], seed=1).frames[0]
+        self._image = known_image()
         self._latest: Sample | None = None
         self._zero = (0.0, 0.0, 1.0, 0.0)
         self._exposure_us = 500.0

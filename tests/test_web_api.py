@@ -247,8 +247,14 @@ def test_answers_are_as_described(client: Any) -> None:
 # ------------------------------------------------------------------------ the websocket
 
 
-def heard(url: str, wishes: dict[str, Any], seconds: float, seen: bool = True) -> list[Any]:
-    """What a client is told in so many seconds."""
+def heard(
+    url: str,
+    wishes: dict[str, Any],
+    seconds: float,
+    seen: bool = True,
+    kinds: set[str] | None = None,
+) -> list[Any]:
+    """What a client is told in so many seconds, or until all kinds of messages have come."""
 
     async def listen() -> list[Any]:
         got = []
@@ -265,15 +271,18 @@ def heard(url: str, wishes: dict[str, Any], seconds: float, seen: bool = True) -
                 got.append((header, arrays))
                 if header["kind"] == "image" and seen:
                     await socket.send('{"seen": true}')
+                if kinds is not None and kinds <= {header["kind"] for header, _ in got}:
+                    break
         return got
 
     return asyncio.run(listen())
 
 
 def test_the_first_messages_show_everything(url: str, station: Any) -> None:
-    got = heard(url, {"channel": "side", "rows_s": 2, "spectrum_s": 4}, 1.0)
+    wanted = {"status", "rows", "image", "spectrum"}
+    got = heard(url, {"channel": "side", "rows_s": 2, "spectrum_s": 4}, 10.0, kinds=wanted)
     kinds = {header["kind"]: (header, arrays) for header, arrays in reversed(got)}
-    assert set(kinds) == {"status", "rows", "image", "spectrum"}
+    assert set(kinds) == wanted
     header, rows = kinds["rows"]
     assert header["first"] and header["next"] == 400
     assert rows["time_s"][-1] - rows["time_s"][0] == pytest.approx(2, abs=0.02)

@@ -23,7 +23,7 @@ from rasnik.live.station import (  # noqa: E402
     StationConfig,
 )
 from rasnik.recording.options import Recording  # noqa: E402
-from rasnik.web.server import PageServer  # noqa: E402
+from rasnik.web.process import page_of  # noqa: E402
 
 CHROMIUM = Path("/usr/bin/chromium")
 if not CHROMIUM.exists():
@@ -73,7 +73,7 @@ def station(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Station]:
 
 @pytest.fixture(scope="module")
 def url(station: Station) -> Iterator[str]:
-    with PageServer(station, Server(port=0)) as server:
+    with page_of(station, Server(port=0)) as server:
         yield server.url
 
 
@@ -221,7 +221,7 @@ def test_from_another_address_the_token_is_needed(
     file.touch(mode=0o600)
     file.write_text(TOKEN)
     os.chmod(file, 0o600)
-    with PageServer(station, Server(host=address, port=0, token_file=file)) as server:
+    with page_of(station, Server(host=address, port=0, token_file=file)) as server:
         assert address in server.url
         context = browser.new_context()
         page = context.new_page()

@@ -23,7 +23,8 @@ from websockets.sync.client import connect  # noqa: E402
 from _web_station import fake_station  # noqa: E402
 from rasnik.live.station import Server  # noqa: E402
 from rasnik.web.guard import LARGEST_BODY  # noqa: E402
-from rasnik.web.server import PageError, PageServer, read_token  # noqa: E402
+from rasnik.web.process import page_of  # noqa: E402
+from rasnik.web.server import PageError, read_token  # noqa: E402
 
 TOKEN = "0123456789abcdef-top-secret"
 WRITE = {"X-Rasnik": "1"}
@@ -40,7 +41,7 @@ def station(tmp_path_factory: pytest.TempPathFactory) -> Any:
 @pytest.fixture(scope="module")
 def open_url(station: Any) -> Iterator[str]:
     """Without a token, for this machine."""
-    with PageServer(station, Server(port=0)) as server:
+    with page_of(station, Server(port=0)) as server:
         yield server.url
         # whatever the tests did, it goes on
         assert httpx.get(server.url + "health").json()["ok"] is True
@@ -49,7 +50,7 @@ def open_url(station: Any) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def closed_url(station: Any, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """With a token."""
-    with PageServer(
+    with page_of(
         station, Server(port=0, token_file=token_file(tmp_path_factory.mktemp("token")))
     ) as server:
         yield server.url
@@ -86,7 +87,7 @@ def raw(url: str, request: bytes, wait_s: float = 5.0) -> bytes:
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.0.2.1", "example.org", ""])
 def test_other_addresses_need_a_token(station: Any, host: str) -> None:
     with pytest.raises(PageError, match="open to everybody.*token_file"):
-        PageServer(station, Server(host=host))
+        page_of(station, Server(host=host))
 
 
 @pytest.mark.parametrize(
@@ -108,13 +109,13 @@ def test_token_files_that_are_not_safe(tmp_path: Path, text: str, mode: int, sen
 
 def test_a_missing_token_file(station: Any, tmp_path: Path) -> None:
     with pytest.raises(PageError, match="cannot be read"):
-        PageServer(station, Server(host="0.0.0.0", token_file=tmp_path / "none"))
+        page_of(station, Server(host="0.0.0.0", token_file=tmp_path / "none"))
 
 
 def test_a_port_that_is_taken(station: Any, open_url: str) -> None:
     port = urlsplit(open_url).port
     with pytest.raises(PageError, match=f"cannot listen on 127.0.0.1, port {port}.*--port"):
-        PageServer(station, Server(port=port or 0)).start()
+        page_of(station, Server(port=port or 0)).start()
 
 
 # ------------------------------------------------------------------------- the token
@@ -408,7 +409,7 @@ def test_a_client_that_never_reads_costs_no_memory(tmp_path: Path) -> None:
     channel.start()
     key = base64.b64encode(b"0123456789abcdef").decode()
     try:
-        with PageServer(station, Server(port=0)) as server:
+        with page_of(station, Server(port=0)) as server:
             parts = urlsplit(server.url)
             line = socket.socket()
             line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

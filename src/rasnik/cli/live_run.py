@@ -28,7 +28,9 @@ _OVER = ("ended", "failed")
 
 def run_live(config: StationConfig, seconds: float | None, page: bool) -> int:
     """Run a station until a signal, the time, or the end of all its channels; the exit status."""
-    with _asked_to_end() as asked:
+    from rasnik.live.priority import before_others
+
+    with _asked_to_end() as asked, before_others(len(config.channel)):
         from rasnik.live.service import Station
 
         try:
@@ -74,10 +76,11 @@ def _services(station: Station, page: bool) -> list[Any]:
     services: list[Any] = []
     controls = station.config.controls
     if page:
-        from rasnik.web.server import PageError, PageServer
+        from rasnik.web.process import page_of
+        from rasnik.web.serving import PageError
 
         try:
-            services.append(PageServer(station, station.config.server))
+            services.append(page_of(station, station.config.server))
         except PageError as error:
             fail(str(error))
     try:

@@ -16,6 +16,7 @@ import time
 from typing import Any
 
 from rasnik.controls.values import STATES, Severity
+from rasnik.live.priority import give_way
 
 __all__ = ["READY", "main"]
 
@@ -29,6 +30,7 @@ _READ_ALARM, _STATE_ALARM, _LIMIT_ALARM = 1, 7, 11
 def main() -> None:
     """Serve until the input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the station, which ends this
+    give_way()
     about = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with, args=(about["parent"],), daemon=True).start()
     values = json.loads(sys.stdin.readline())

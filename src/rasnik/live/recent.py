@@ -62,23 +62,34 @@ class Recent:
             self._rows[self._count % len(self._rows)] = row
             self._count += 1
 
-    def since(self, index: int) -> tuple[NDArray[Any], int]:
+    def extend(self, rows: NDArray[Any], following: int) -> None:
+        """Take rows of another ring of this size; the next one there has the index `following`."""
+        with self._lock:
+            size = len(self._rows)
+            rows = rows[-size:]
+            self._rows[np.arange(following - len(rows), following) % size] = rows
+            self._count = following
+
+    def since(self, index: int, most: int | None = None) -> tuple[NDArray[Any], int]:
         """Rows from an index on, as far as they are kept, and the index to continue from.
 
         Parameters
         ----------
         index : int
             0 for all; what the last call returned for those that are new.
+        most : int, optional
+            No more rows than this, the oldest first.
         """
         with self._lock:
-            first = min(max(index, self._count - len(self._rows), 0), self._count)
             size = len(self._rows)
-            start, stop = first % size, self._count % size
-            if first == self._count:
-                return self._rows[:0].copy(), self._count
+            first = min(max(index, self._count - size, 0), self._count)
+            end = self._count if most is None else min(self._count, first + most)
+            start, stop = first % size, end % size
+            if first == end:
+                return self._rows[:0].copy(), end
             if start < stop:
-                return self._rows[start:stop].copy(), self._count
-            return np.concatenate([self._rows[start:], self._rows[:stop]]), self._count
+                return self._rows[start:stop].copy(), end
+            return np.concatenate([self._rows[start:], self._rows[:stop]]), end
 
     def last(self, seconds: float) -> NDArray[Any]:
         """Rows of the last seconds before the newest, by the host's clock."""

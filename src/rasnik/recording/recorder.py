@@ -223,6 +223,13 @@ class Recorder:
         """
         return self._history.read(start_s, end_s, points)
 
+    def current(self) -> tuple[Path, NDArray[Any]] | None:
+        """The file that is being written and the bins of its summary, as `History` wants them.
+
+        With it another process reads the record while this one measures.
+        """
+        return self._files.current()
+
     # ------------------------------------------------------------------ in the thread
 
     def _is_idle(self) -> bool:

@@ -1,30 +1,25 @@
-"""The page's server: a thread beside the cameras."""
+"""Where the page listens, and who may look."""
 
 from __future__ import annotations
 
 import os
 import socket
 import stat
-import threading
-import time
+from abc import ABC, abstractmethod
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from rasnik.cameras.addresses import is_loopback
 from rasnik.live.station import Server
+from rasnik.web.serving import PageError, Serving
 
 if TYPE_CHECKING:
     from rasnik.live.service import Station
 
-__all__ = ["PageError", "PageServer", "read_token"]
+__all__ = ["Page", "PageError", "PageServer", "read_token"]
 
 #: Letters of a token, at least.
 SHORTEST_TOKEN = 16
-_PATIENCE_S = 10.0
-
-
-class PageError(Exception):
-    """The page cannot be served; the message is a sentence with its remedy."""
 
 
 def read_token(path: Path) -> str:
@@ -54,8 +49,8 @@ def read_token(path: Path) -> str:
     return token
 
 
-class PageServer:
-    """Serves the page and the HTTP interface of a station.
+class Page(ABC):
+    """The page and the HTTP interface of a station: its address and token. A context manager.
 
     Parameters
     ----------
@@ -78,8 +73,6 @@ class PageServer:
                 f"The page would be open to everybody at {config.host}: give a token_file in "
                 "[server] of the station file, or listen on 127.0.0.1."
             )
-        self._server: Any = None
-        self._thread: threading.Thread | None = None
         self._port = config.port
 
     @property
@@ -98,51 +91,21 @@ class PageServer:
         PageError
             If the port is taken, or a package is missing.
         """
-        try:
-            import uvicorn
-
-            from rasnik.web.app import create_app
-        except ImportError as error:
-            raise PageError(
-                f"The page needs {error.name}; install it with: pip install 'rasnik[live]'"
-            ) from None
         listener = self._listener()
         self._port = listener.getsockname()[1]
-        self._server = uvicorn.Server(
-            uvicorn.Config(
-                create_app(self._station, token=self._token),
-                ws="websockets-sansio",
-                http="h11",
-                loop="asyncio",
-                lifespan="off",
-                log_config=None,
-                access_log=False,
-                server_header=False,
-                proxy_headers=False,
-                ws_max_size=16 * 1024,
-                ws_per_message_deflate=False,  # pictures are compressed already
-                limit_concurrency=200,
-                timeout_keep_alive=15,
-                timeout_graceful_shutdown=2,
-            )
-        )
-        self._thread = threading.Thread(
-            target=self._server.run, args=([listener],), name="page", daemon=True
-        )
-        self._thread.start()
-        end = time.monotonic() + _PATIENCE_S
-        while not self._server.started:
-            if not self._thread.is_alive() or time.monotonic() > end:
-                raise PageError("The page's server did not start; the log says why.")
-            time.sleep(0.005)
+        try:
+            self._serve(listener)
+        except BaseException:
+            listener.close()
+            raise
 
+    @abstractmethod
+    def _serve(self, listener: socket.socket) -> None:
+        """Answer on a listener, which belongs to this page from now on."""
+
+    @abstractmethod
     def stop(self) -> None:
         """Close all connections; harmless if it does not run."""
-        if self._server is None or self._thread is None:
-            return
-        self._server.should_exit = True
-        self._thread.join(_PATIENCE_S)
-        self._server = self._thread = None
 
     def __enter__(self) -> Self:
         self.start()
@@ -169,3 +132,20 @@ class PageServer:
                 "Choose another with --port; 0 takes any that is free."
             ) from None
         return listener
+
+
+class PageServer(Page):
+    """The page served by a thread of this process: for tests, and where no process can be had."""
+
+    def __init__(self, station: Station, config: Server) -> None:
+        super().__init__(station, config)
+        self._serving: Serving | None = None
+
+    def _serve(self, listener: socket.socket) -> None:
+        self._serving = Serving(self._station, self._token, listener)
+
+    def stop(self) -> None:
+        """Close all connections; harmless if it does not run."""
+        if self._serving is not None:
+            self._serving.stop()
+            self._serving = None

@@ -1,0 +1,73 @@
+"""Frames before other programs, where the system allows it."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+
+__all__ = ["NICE", "REAL_TIME", "before_others", "give_way"]
+
+#: Where it may, a station runs in real time at the least priority there is (sched(7), SCHED_RR):
+#: before all that does not, and no sooner than what the system itself needs.
+REAL_TIME = 1
+#: Else before programs that are at 0, by setpriority(2).
+NICE = -10
+_AFTER = 5
+
+
+@contextmanager
+def before_others(channels: int) -> Iterator[str]:
+    """Run this thread, and those it starts, before other programs; what is not allowed is left.
+
+    The whole station is raised and not the tracker alone: a thread that holds the interpreter's
+    lock and does not run keeps the tracker waiting, too. Real time is for machines with a core
+    more than channels: with less, a station that cannot keep up would leave nothing for others.
+
+    Parameters
+    ----------
+    channels : int
+        Of the station; each may keep a core busy.
+
+    Yields
+    ------
+    str
+        What was had: "real time", "nice -10" or another number, "" if nothing.
+    """
+    if sys.platform != "linux":  # elsewhere these calls concern other things than a thread
+        yield ""
+        return
+    policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+    nice = os.getpriority(os.PRIO_PROCESS, 0)
+    had = _real_time() if len(os.sched_getaffinity(0)) > channels else ""
+    try:
+        yield had or _lowered(nice)
+    finally:
+        with suppress(OSError):
+            os.sched_setscheduler(0, policy, parameter)
+            os.setpriority(os.PRIO_PROCESS, 0, nice)
+
+
+def give_way() -> None:
+    """Let other programs run before this one, whatever started it; no thread may run yet."""
+    if sys.platform == "linux":
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.setpriority(os.PRIO_PROCESS, 0, max(_AFTER, os.getpriority(os.PRIO_PROCESS, 0)))
+
+
+def _real_time() -> str:
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(REAL_TIME))
+    except OSError:
+        return ""
+    return "real time"
+
+
+def _lowered(nice: int) -> str:
+    """Lower the niceness as far as a limit allows."""
+    for wanted in range(min(NICE, nice), 0):
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, 0, wanted)
+            return f"nice {wanted}"
+    return ""
