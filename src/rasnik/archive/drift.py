@@ -35,7 +35,7 @@ _BINS = 192
 _COARSEST = 24
 _LEAST_BINS = 8
 _LEAST_EFFECTIVE = 4.0  # with fewer, an error says nothing
-_LONG_MEMORY = 0.35  # correlation of the coarsest bins; of short memory it is 0 +- 0.2
+_LONG_MEMORY = 2.0  # correlation of the coarsest bins, in units of its error without memory
 _CUT = 6.0  # robust standard deviations at which residuals are cut off
 _EFFICIENCY = 3.0 / math.pi  # of the median of slopes, for Gaussian errors (Sen 1968)
 
@@ -50,8 +50,10 @@ class Drift:
         Units of the values per day; NaN where not measured.
     correlation : float
         Of the residuals in neighbouring bins, for the width that sets the error.
+    bins : int
+        Bins of that width.
     effective : float
-        Number of independent points that it leaves.
+        Number of independent points that the correlation leaves.
     remark : str
         Why there is no slope, or no error of it; or that the error is a lower limit.
     """
@@ -59,6 +61,7 @@ class Drift:
     slope: float = math.nan
     sigma: float = math.nan
     correlation: float = math.nan
+    bins: int = 0
     effective: float = math.nan
     remark: str = ""
 
@@ -66,9 +69,8 @@ class Drift:
         """For JSON; None where not measured."""
         numbers = ("slope", "sigma", "correlation", "effective")
         values = {name: getattr(self, name) for name in numbers}
-        return {k: v if math.isfinite(v) else None for k, v in values.items()} | {
-            "remark": self.remark
-        }
+        known = {k: v if math.isfinite(v) else None for k, v in values.items()}
+        return known | {"bins": self.bins, "remark": self.remark}
 
 
 def drift(time_s: NDArray[np.float64], values: NDArray[np.float64]) -> Drift:
@@ -98,7 +100,8 @@ def _judged(lines: list[Drift]) -> Drift:
     unsure = [line for line in lines if not math.isfinite(line.sigma)]
     line = unsure[0] if unsure else max(lines, key=lambda one: one.sigma)
     remark = line.remark
-    if not unsure and lines[-1].correlation > _LONG_MEMORY:
+    coarsest = lines[-1]
+    if not unsure and coarsest.correlation > _LONG_MEMORY / math.sqrt(coarsest.bins):
         remark = "it wanders on all time scales; the error is a lower limit"
     return replace(line, slope=lines[0].slope, remark=remark)
 
@@ -143,7 +146,7 @@ def _line(t: NDArray[np.float64], y: NDArray[np.float64]) -> Drift:
     total = float(residuals @ residuals)
     n = len(t)
     if not total > 0:  # a line without any scatter
-        return Drift(slope, 0.0, 0.0, float(n))
+        return Drift(slope, 0.0, 0.0, n, float(n))
     measured = float(residuals[1:] @ residuals[:-1]) / total
     # Fitting a mean lowers it by (1 + 4 r)/n (M. G. Kendall, Biometrika 41 (1954) 403); a slope,
     # by about 1/n more.
@@ -151,7 +154,7 @@ def _line(t: NDArray[np.float64], y: NDArray[np.float64]) -> Drift:
     effective = n * (1 - correlation) / (1 + correlation)
     if effective < _LEAST_EFFECTIVE:
         remark = "it wanders so slowly that the error of a line cannot be told"
-        return Drift(slope, math.nan, correlation, effective, remark)
+        return Drift(slope, math.nan, correlation, n, effective, remark)
     spread = float(np.sum((t - t.mean()) ** 2))
     sigma = math.sqrt(total / (effective - 2) / spread / _EFFICIENCY)
-    return Drift(slope, sigma, correlation, effective)
+    return Drift(slope, sigma, correlation, n, effective)
