@@ -67,7 +67,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("code_lines_read", "int", "", "code lines with a certain reading"),
     Column("code_lines_in_view", "int", "", "code lines in view"),
     Column("masked_fraction", "float", "", "fraction of the pixels left out"),
-    Column("method", "word", "", "likelihood, fourier, or none"),
+    Column("method", "word", "", "likelihood, fourier, lwdaq (read from its lines), or none"),
     Column("model", "word", "", "similarity, affine or projective"),
     Column("notes", "list", "", "what was done to the image on reading it"),
     Column("candidates", "list", "", "poses that explain an ambiguous image, best first"),
