@@ -241,7 +241,7 @@ class Poses:
             self._vain += 1
         if self._vain > _IN_VAIN:
             self._tracker = None
-            self._vain, self._leave_left = 0, self._leave
+            self._vain, self._leave_left = _IN_VAIN - 1, self._leave  # the next try is short
             self._leave = min(2 * self._leave, _LONGEST_LEAVE)
         return pose if pose.ok else None
 
