@@ -99,6 +99,7 @@ def test_errors_of_the_index_are_those_of_draws(rng) -> None:
         ({"temperature_k": 20}, "temperature_k = 20 is outside 233"),
         ({"pressure_hpa": math.nan}, "pressure_hpa = nan"),
         ({"sigma_humidity": -1}, "must not be negative"),
+        ({"pressure_hpa": 5}, "means 11.7 hPa of water vapour, more than pressure_hpa = 5"),
     ],
 )
 def test_air_out_of_range_is_said(change, sentence) -> None:

@@ -322,6 +322,8 @@ def test_what_cannot_be_inverted_is_said() -> None:
         displacements(BENCH, np.zeros(4), ("lens_x", "lens_x"))
     with pytest.raises(ValueError, match="positive definite"):
         displacements(BENCH, np.zeros(4), ("lens_x",), np.zeros((4, 4)))
+    with pytest.raises(ValueError, match="not known or not positive"):
+        displacements(BENCH, np.zeros(4), ("lens_x",), np.full((4, 4), np.nan))
     with pytest.raises(ValueError, match="readings are x_um"):
         displacements(BENCH, np.zeros(4), ("lens_x",), None, ("x",))
     with pytest.raises(KeyError, match="there is no motion 'lens_turn_x'"):

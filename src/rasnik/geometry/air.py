@@ -112,6 +112,12 @@ class Air:
         for name in ("sigma_temperature_k", "sigma_pressure_hpa", "sigma_humidity"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ValueError(f"air: {name} = {getattr(self, name):g} must not be negative")
+        vapour_hpa = self.humidity * float(_saturation_pa(self.temperature_k)) / _PA_PER_HPA
+        if vapour_hpa > self.pressure_hpa:
+            raise ValueError(
+                f"air: humidity = {self.humidity:g} means {vapour_hpa:.3g} hPa of water vapour, "
+                f"more than pressure_hpa = {self.pressure_hpa:g}; in a vacuum the humidity is 0"
+            )
 
     @property
     def index(self) -> float:

@@ -151,15 +151,16 @@ def _with_errors(
 ) -> Displacement:
     """The result with what the covariance of the reading makes of it."""
     rows, n = _rows(use), len(names)
-    chi2, covariance = math.nan, np.full((n, n), np.nan)
-    if noise is not None and np.isfinite(noise[np.ix_(rows, rows)]).all():
-        vector = _full(names, found)
-        slopes = instrument.slopes(vector)[np.ix_(rows, [motion_index(name) for name in names])]
-        inverse = np.linalg.inv(noise[np.ix_(rows, rows)])
-        covariance = np.linalg.inv(slopes.T @ inverse @ slopes)
-        if len(rows) > n:
-            left = _difference(values, instrument.values(vector))[rows]
-            chi2 = float(left @ inverse @ left)
+    part = np.full((len(rows), len(rows)), np.nan) if noise is None else noise[np.ix_(rows, rows)]
+    vector = _full(names, found)
+    slopes = instrument.slopes(vector)[np.ix_(rows, [motion_index(name) for name in names])]
+    if len(rows) == n:
+        back: Array = np.linalg.inv(slopes)
+        return Displacement(names, found, back @ part @ back.T, math.nan, 0)
+    inverse = np.linalg.inv(part)  # was found positive definite
+    covariance = np.linalg.inv(slopes.T @ inverse @ slopes)
+    left = _difference(values, instrument.values(vector))[rows]
+    chi2 = float(left @ inverse @ left)
     return Displacement(names, found, covariance, chi2, len(rows) - n)
 
 
@@ -227,11 +228,11 @@ def _whitening(
         return np.diag(1 / instrument.natural_readings[rows])
     part = np.asarray(covariance, dtype=np.float64)[np.ix_(rows, rows)]
     try:
-        return np.linalg.inv(np.linalg.cholesky(part))
+        if np.isfinite(part).all():
+            return np.linalg.inv(np.linalg.cholesky(part))
     except np.linalg.LinAlgError:
-        raise ValueError(
-            f"the covariance of {', '.join(use)} is not one: it must be positive definite"
-        ) from None
+        pass
+    raise ValueError(f"the covariance of {', '.join(use)} is not known or not positive definite")
 
 
 def _solve(
