@@ -66,7 +66,7 @@ def draw_ring_down(found: RingDown, path: str | os.PathLike[str], *, title: str 
 
 def budget_figure(found: SelfNoise) -> Figure:
     """The terms and their sum as acceleration of the ground, beside the noise models."""
-    figure = Figure(figsize=(9.5, 6.4), dpi=_DPI, layout="constrained")
+    figure = Figure(figsize=(9.5, 7.2), dpi=_DPI, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     _draw_models(axes, found.frequency_hz, "acceleration")
@@ -82,14 +82,16 @@ def budget_figure(found: SelfNoise) -> Figure:
     suspension = found.suspension
     mass = f", {suspension.mass_kg:g} kg" if suspension.mass_kg else ""
     quiet = ", ".join(f"{low:.3g} to {high:.3g} Hz" for low, high in found.quiet_hz) or "nowhere"
-    left_out = "".join(f"\nnot counted: {one}" for one in found.not_counted)
+    left_out = "".join(f"\nnot counted: {one.partition(':')[0]}" for one in found.not_counted)
     axes.set_title(
         f"{found.system.name} reading a mass of f0 = {suspension.frequency_hz:g} Hz, "
         f"Q = {suspension.q:g}{mass}, along {found.axis}\n"
         f"self-noise below the low-noise model (shaded): {quiet}{left_out}",
         fontsize=10,
     )
-    axes.legend(fontsize=8.5, loc="best")
+    # The dips at the resonance go as deep as Q is high, and tell nothing.
+    axes.set_ylim(bottom=0.03 * float(found.total.min()))
+    figure.legend(fontsize=8.5, loc="outside lower center", ncols=2, frameon=False)
     return figure
 
 
@@ -125,8 +127,10 @@ def ground_figure(
     spectra = []
     for k, (name, motion) in enumerate(motions.items()):
         _draw_motion(figure.add_subplot(grid[k]), name, motion, _COLOURS[k % len(_COLOURS)])
-        try:
-            spectra.append((k, name, motion, welch(motion)))
+        longest_s = max(len(run) for run in motion.runs()) / motion.rate_hz
+        try:  # windows that hold a few periods of the lowest frequency, where there are any
+            window_s = min(4 / motion.band_hz[0], longest_s)
+            spectra.append((k, name, motion, welch(motion, length_s=window_s)))
         except ValueError:  # too short for a spectrum; the motion itself is drawn
             continue
     low, high = next(iter(motions.values())).corners_hz[::3]
@@ -177,7 +181,8 @@ def _draw_spectrum(
     )
     f_hz = spectrum.frequency_hz[inside]
     axes.plot(f_hz, spectrum.asd[inside] * metres, color=colour, linewidth=1, label=name)
-    if math.isfinite(sigma) and len(f_hz):
+    if math.isfinite(sigma):
+        f_hz = np.geomspace(*motion.corners_hz[::3], 400)
         noise = readout_asd(f_hz, sigma * metres, motion.rate_hz, suspension, motion.quantity)
         axes.plot(
             f_hz, noise, color=colour, linestyle=_DASHES[0], linewidth=1.2,
@@ -199,15 +204,15 @@ def ring_down_figure(found: RingDown, *, title: str = "") -> Figure:
     steady = found.offset + found.drift * time_s
     decay = found.amplitude * np.exp(-np.pi * found.frequency_hz * found.loss * time_s)
     shown = series.start_s + time_s
-    thin = _thinned(shown, series.values)
+    thin = _thinned(shown, series.values - found.offset)
     above.plot(*thin, color=_COLOURS[0], linewidth=0.7, label="readings")
     for sign in (1, -1):
         above.plot(
-            shown, steady + sign * decay, color=_COLOURS[1], linewidth=1.2,
+            shown, steady - found.offset + sign * decay, color=_COLOURS[1], linewidth=1.2,
             label="fitted decay" if sign > 0 else None,
         )  # fmt: skip
     below.plot(*_thinned(shown, series.values - fitted), color=_COLOURS[0], linewidth=0.6)
-    above.set_ylabel(f"reading, {series.unit}")
+    above.set_ylabel(f"reading less {found.offset:.10g} {series.unit}, {series.unit}")
     below.set_ylabel(f"remainder, {series.unit}")
     below.set_xlabel("time, s")
     sigmas = found.sigmas

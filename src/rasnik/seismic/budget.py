@@ -39,6 +39,10 @@ BOLTZMANN = 1.380649e-23
 #: K, 20 degrees Celsius.
 ROOM_K = 293.15
 
+_SLOW = (
+    "slow drifts and tilt: what air, temperature and creep do to readout and suspension has no "
+    "common law in frequency; add it as measured"
+)
 _LOWEST_HZ, _HIGHEST_HZ, _POINTS = 1e-3, 100.0, 601
 
 #: White noise of the reading in pm/sqrt(Hz), or the ASD of the acceleration of the ground in
@@ -288,7 +292,7 @@ def self_noise(
 
     white = _readout(system, axis, rate, reading_pm_rthz, pose)
     terms = [Term(name, reading(pm), source) for name, pm, source in white]
-    not_counted = []
+    not_counted = [_SLOW]
     if suspension.mass_kg is None:
         not_counted.append("thermal noise of the suspension: the mass is not known")
     else:
