@@ -9,7 +9,6 @@ import math
 
 import numpy as np
 import pytest
-from PIL import Image
 from typer.testing import CliRunner
 
 from rasnik import analyse, load_system
@@ -48,16 +47,15 @@ def run(*arguments: object, status: int = 0):
 # ------------------------------------------------------------------------ images
 
 
-@pytest.mark.parametrize("suffix", [".png", ".gif"])
+@pytest.mark.parametrize("suffix", [".png", ".gif", ".daq"])
 def test_a_written_image_comes_back_with_bounds_and_text(tmp_path, suffix):
     path = tmp_path / f"a{suffix}"
     write_lwdaq_image(path, GREY, (5, 2, 90, 30), "Sensor 12, 14 C")
-    with Image.open(path) as opened:
-        image = np.asarray(opened.convert("L"))
-    np.testing.assert_array_equal(image[1:], GREY[1:])
-    assert lwdaq_bounds(image) == (5, 2, 90, 30)
-    assert lwdaq_text(image) == "Sensor 12, 14 C"
-    (frame,) = iter_frames([path])
+    (frame,) = iter_frames([tmp_path])
+    assert frame.image is not None
+    np.testing.assert_array_equal(frame.image[1:], GREY[1:])
+    assert lwdaq_bounds(frame.image) == (5, 2, 90, 30)
+    assert lwdaq_text(frame.image) == "Sensor 12, 14 C"
     assert frame.bounds_px == (5, 2, 90, 30)
     assert frame.header_rows == 1
     assert "its text: Sensor 12, 14 C" in frame.notes
@@ -105,8 +103,19 @@ def test_what_cannot_be_in_a_header(image, options, message):
         with_lwdaq_header(image, **options)
 
 
+def test_a_daq_file_is_the_pixels_and_nothing_else(tmp_path):
+    path = tmp_path / "a.daq"
+    write_lwdaq_image(path, GREY, text="ab")
+    assert path.read_bytes() == with_lwdaq_header(GREY, text="ab").tobytes()
+    for content in (path.read_bytes()[:-1], path.read_bytes() + b"x", b"\0"):
+        path.write_bytes(content)
+        (frame,) = iter_frames([path])
+        assert frame.image is None
+        assert "truncated" in (frame.error or "")
+
+
 def test_other_suffixes(tmp_path):
-    with pytest.raises(ValueError, match=r"ends in \.png or \.gif"):
+    with pytest.raises(ValueError, match=r"ends in one of \.png, \.gif, \.daq"):
         write_lwdaq_image(tmp_path / "a.jpg", GREY)
 
 

@@ -32,7 +32,7 @@ __all__ = [
 Image = NDArray[Any]
 
 #: What a folder is searched for.
-IMAGE_SUFFIXES = tuple(".png .tif .tiff .gif .bmp .pgm .ppm .pnm .npy .jpg .jpeg".split())
+IMAGE_SUFFIXES = tuple(".png .tif .tiff .gif .bmp .pgm .ppm .pnm .npy .jpg .jpeg .daq".split())
 #: HDF5 files hold images or results; they are read when named or matched by a pattern.
 STACK_SUFFIXES = (".h5", ".hdf5")
 #: A folder is searched for videos if it holds no images.
@@ -383,6 +383,10 @@ def open_stack(path: Path | str, dataset: str | None = None) -> AbstractContextM
     for magic, opener in _MAGIC:
         if head.startswith(magic):
             return opener(path)
+    if suffix == ".daq":
+        from rasnik.io.daq import open_daq
+
+        return open_daq(path)
     if _is_video(head, suffix):
         return _open_video(path)
     known = ", ".join(s[1:] for s in (*IMAGE_SUFFIXES, *STACK_SUFFIXES, *VIDEO_SUFFIXES))

@@ -39,11 +39,10 @@ from pathlib import Path
 from typing import Any, TextIO
 from urllib.parse import unquote
 
-import numpy as np
-
 from rasnik import __version__
 from rasnik.analysis.flags import FLAGS, Flag
-from rasnik.io.columns import check_record, flag_value
+from rasnik.analysis.pose import Pose
+from rasnik.io.columns import check_record, flag_value, make_record, plain
 from rasnik.io.line_file import LineFile
 from rasnik.io.results import Record, ResultWriter
 from rasnik.io.utc import EARLIEST_S, utc_time
@@ -348,17 +347,13 @@ def icaras_records(path: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
     """
     for reading in read_icaras(path):
         if isinstance(reading, str):
-            yield {"file": str(path), "ok": False, "flags": [], "error": reading}
+            yield make_record(str(path), error=reading)
             continue
         named = re.fullmatch(r"(.*)\[(\d+)\]", reading.rasnik_id)
-        ok, flags = reading.ierr == 0, Flag(reading.ierr) & _FATAL
-        reasons = [f"{info.sentence} {info.remedy}" for info in FLAGS if flags & info.flag]
-        known = {name: value for name, value in reading.values.items() if np.isfinite(value)}
-        yield {
-            "file": named[1] if named else reading.rasnik_id or str(path),
-            "frame": int(named[2]) if named else reading.sequence,
-            "ok": ok,
-            "flags": flags.names,
-            "error": None if ok else " ".join(reasons) or "No result.",
-            **(known if ok else {}),
-        }
+        file = named[1] if named else reading.rasnik_id or str(path)
+        frame = int(named[2]) if named else reading.sequence
+        flags = Flag(reading.ierr) & _FATAL
+        record = make_record(file, frame, Pose(ok=reading.ierr == 0, flags=flags))
+        if reading.ierr == 0:
+            record |= {name: plain(value) for name, value in reading.values.items()}
+        yield record

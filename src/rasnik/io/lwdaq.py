@@ -20,7 +20,7 @@ __all__ = ["lwdaq_bounds", "lwdaq_text", "with_lwdaq_header", "write_lwdaq_image
 
 _HEADER_BYTES = 12
 #: Formats that hold 8-bit grey levels as they are, and that LWDAQ opens.
-_PICTURES = (".png", ".gif")
+_SUFFIXES = (".png", ".gif", ".daq")
 
 
 def lwdaq_bounds(image: NDArray[Any]) -> tuple[int, int, int, int] | None:
@@ -136,7 +136,7 @@ def write_lwdaq_image(
     Parameters
     ----------
     path : path-like
-        Ends in ``.png`` or ``.gif``; an existing file is replaced.
+        Ends in ``.png``, ``.gif`` or ``.daq``; an existing file is replaced.
     image, bounds_px, text
         As for `with_lwdaq_header`.
 
@@ -147,8 +147,13 @@ def write_lwdaq_image(
     OSError
         If the file cannot be written.
     """
-    if Path(path).suffix.lower() not in _PICTURES:
-        raise ValueError(f"{path}: an LWDAQ image ends in {' or '.join(_PICTURES)}")
+    suffix = Path(path).suffix.lower()
+    if suffix not in _SUFFIXES:
+        raise ValueError(f"{path}: an LWDAQ image ends in one of {', '.join(_SUFFIXES)}")
+    headed = with_lwdaq_header(image, bounds_px, text)
+    if suffix == ".daq":
+        headed.tofile(path)
+        return
     from PIL import Image
 
-    Image.fromarray(with_lwdaq_header(image, bounds_px, text)).save(path)
+    Image.fromarray(headed).save(path)
