@@ -385,7 +385,7 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 def test_unknown_name_offers_the_near_ones() -> None:
     with pytest.raises(SystemConfigError, match=r"'solidrass': .*did you mean solidras"):
         load_system("solidrass")
-    with pytest.raises(SystemConfigError, match="Shipped are atlas-ccd, microras, .*solidras") as c:
+    with pytest.raises(SystemConfigError, match="Shipped are atlas-ccd, lunar, .*solidras") as c:
         load_system("xyz")
     assert "did you mean" not in str(c.value)
 

@@ -43,7 +43,8 @@ __all__ = [
 # they give is a rough one.
 _SCALE_TOLERANCE = 0.1
 
-Millimetres = Annotated[float, Field(gt=0, le=1e6)]
+# Up to 100 km: a light path on the Moon has some ten.
+Millimetres = Annotated[float, Field(gt=0, le=1e8)]
 
 
 class _Part(BaseModel):
