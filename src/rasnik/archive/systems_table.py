@@ -121,7 +121,8 @@ class SystemsTable:
             try:
                 rows[name] = _settings(cells, systems)
             except SystemConfigError as error:
-                rows[name or label] = "; ".join(f"{path}, {label}: {p}" for p in error.problems)
+                where = f"{path}, {label}" + (f": {error.source}" if error.source else "")
+                rows[name or label] = "; ".join(f"{where}: {p}" for p in error.problems)
         if not rows:
             raise SystemConfigError(str(path), ["the table has no rows"])
         return cls(str(path), _with_default(rows, default))

@@ -30,6 +30,7 @@ Document = Mapping[str, Any]
 _DPI = 110
 _COLOURS = {"x": "#2f6fb3", "y": "#d1762b"}
 _FAILED = "#b3382f"
+_SPREAD = 300.0  # largest over median
 _MOST_NAMES = 24  # on an axis
 _MOST_REMARKS = 200  # on the page
 _STYLE = """
@@ -124,18 +125,20 @@ def _draw_drifts(axes: Axes, instruments: Sequence[Document]) -> None:
         known = [f.get("slope") if f.get("sigma") is not None else None for f in found]
         _points(axes, name, known, [f.get("sigma") for f in found])
     axes.axhline(0.0, color="black", linewidth=1)
-    axes.set_yscale("symlog", linthresh=_linear_range(axes))
+    _spread_out(axes)
     axes.set_ylabel("drift, um/day")
     axes.set_title("Drift with one standard deviation", fontsize=10)
 
 
-def _linear_range(axes: Axes) -> float:
-    """Where a symmetric logarithmic axis is linear: the median size of what is drawn."""
+def _spread_out(axes: Axes) -> None:
+    """A logarithmic axis on both sides of zero, where a few values are far larger than most."""
     sizes = np.concatenate(
         [np.abs(np.asarray(line.get_ydata(), dtype=float)) for line in axes.lines]
     )
     sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
-    return float(np.median(sizes)) * 3 if len(sizes) else 1.0
+    if len(sizes) and sizes.max() > _SPREAD * np.median(sizes):
+        axes.set_yscale("symlog", linthresh=3 * float(np.median(sizes)))
+        axes.set_ylim(-3 * sizes.max(), 3 * sizes.max())
 
 
 def _draw_failures(axes: Axes, instruments: Sequence[Document]) -> None:
@@ -328,7 +331,8 @@ def _picture(one: Picture) -> str:
     about = one.about
     name = f"{about['file']}[{about['frame']}]" if about["frame"] else about["file"]
     image = "" if one.png is None else _image(one.png, name)
-    remark = f" <span class=soft>{_text(one.remark)}</span>" if one.remark else ""
+    says_more = one.remark not in ("", about["sentence"])
+    remark = f" <span class=soft>{_text(one.remark)}</span>" if says_more else ""
     return (
         f"<figure><figcaption><b>{_text(about['kind'])}</b>, {_text(about['instrument'])}: "
         f"<code>{_text(name)}</code><br>{_text(about['sentence'])}{remark}</figcaption>{image}"
