@@ -155,10 +155,10 @@ def _with_errors(
     vector = _full(names, found)
     slopes = instrument.slopes(vector)[np.ix_(rows, [motion_index(name) for name in names])]
     if len(rows) == n:
-        back: Array = np.linalg.inv(slopes)
-        return Displacement(names, found, back @ part @ back.T, math.nan, 0)
+        back = np.linalg.inv(slopes)
+        return Displacement(names, found, np.asarray(back @ part @ back.T), math.nan, 0)
     inverse = np.linalg.inv(part)  # was found positive definite
-    covariance = np.linalg.inv(slopes.T @ inverse @ slopes)
+    covariance = np.asarray(np.linalg.inv(slopes.T @ inverse @ slopes))
     left = _difference(values, instrument.values(vector))[rows]
     chi2 = float(left @ inverse @ left)
     return Displacement(names, found, covariance, chi2, len(rows) - n)
