@@ -40,7 +40,12 @@ def open_zarr(url: str, array: str | None = None) -> Iterator[Stack]:
     """
     item, group = _image_array(_opened(url), array, url)
     stack = frames_of_array(_Chunked(item), f"the array {item.path or 'of the store'}")
-    yield Stack(stack.count, stack.read, time_s=times_as_function(_times(group), stack.count))
+
+    def read(index: int) -> tuple[NDArray[Any], tuple[str, ...]]:
+        image, notes = stack.read(index)
+        return image, notes + _even_parts(image, item)
+
+    yield Stack(stack.count, read, time_s=times_as_function(_times(group), stack.count))
 
 
 def zarr_bytes(url: str) -> int:
@@ -93,6 +98,23 @@ def _times(group: Any) -> NDArray[np.float64] | None:
         if name in group and getattr(group[name], "ndim", None) == 1:
             return np.asarray(group[name][:], dtype=np.float64)
     return None
+
+
+def _even_parts(image: NDArray[Any], array: Any) -> tuple[str, ...]:
+    """A note where a part of an image may be a chunk that is missing.
+
+    A part that is dark throughout is not stored either, so this need not be a fault.
+    """
+    height, width = array.chunks[:2] if array.ndim == 2 else array.chunks[1:3]
+    if array.fill_value is None or (height >= image.shape[0] and width >= image.shape[1]):
+        return ()
+    even = image == array.fill_value
+    rows = np.logical_and.reduceat(even, np.arange(0, image.shape[0], height), axis=0)
+    parts = np.logical_and.reduceat(rows, np.arange(0, image.shape[1], width), axis=1)
+    count = int(parts.sum())
+    if not count:
+        return ()
+    return (f"{count} of {parts.size} chunks are {array.fill_value} throughout, or missing",)
 
 
 class _Chunked:
