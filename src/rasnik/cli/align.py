@@ -221,7 +221,7 @@ def _print_fit(found: Adjustment) -> None:
 
     console = output()
     if found.ndf:
-        text = f"chi2 {found.chi2:.1f} for {found.ndf} degrees of freedom"
+        text = f"chi2 {found.chi2:.1f} for {found.ndf:.3g} degrees of freedom"
         likely = not found.probability < LEAST_PROBABILITY
         style = None if likely else "red"
         console.print(f"{text}, probability {found.probability:.3g}", style=style)

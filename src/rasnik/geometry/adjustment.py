@@ -232,6 +232,20 @@ class _Fit:
         """Of the free degrees of freedom: those with next to no share in unmeasured motions."""
         return np.asarray(np.linalg.norm(self.space, axis=1) <= LEAKAGE)
 
+    def chi2(self) -> float:
+        """Of readings and priors; NaN without readings."""
+        known = self.n_readings + len(self.priors)
+        return float(np.sum(self.misfits(self.parameters)[:known] ** 2))
+
+    def ndf(self) -> float:
+        """What readings and priors are not used up by the motions.
+
+        A whole number, unless the motions that are found make readings sensitive to one that is
+        unmeasured at the nominal places: then part of a reading goes into that.
+        """
+        known = self.n_readings + len(self.priors)
+        return round(known - float(np.sum(self.left[:known] ** 2)), 6)
+
     def snooping(self) -> Snooping:
         tested = np.arange(len(self.left)) < self.n_readings + len(self.priors)
         return snoop(self.left, -self.misfits(self.parameters), tested)
@@ -302,8 +316,7 @@ def _result(
         np.where(measured | ~free, estimate, np.nan) if has_data else np.full(free.shape, np.nan)
     )
 
-    squares = float(np.sum(fit.misfits(fit.parameters) ** 2)) if has_data else np.nan
-    ndf = len(fit.left) - len(fit.ranges)
+    squares, ndf = fit.chi2(), fit.ndf()
     checks = _checks(fit, offered)
     return Adjustment(
         network,
@@ -315,7 +328,7 @@ def _result(
         tuple(name_motions(network, free, fit.space, fit.ranges, np.asarray(fit.used.any(axis=1)))),
         squares,
         ndf,
-        float(chi2.sf(squares, ndf)) if has_data and ndf else np.nan,
+        float(chi2.sf(squares, ndf)) if ndf else np.nan,
         checks,
         tuple(outliers),
         sagitta,

@@ -101,9 +101,10 @@ class Adjustment:
         What can move; what the readings measure; what is known, but from its prior alone.
     unmeasured : tuple of Unmeasured
         All motions that no reading shows, the simplest names for them.
-    chi2, ndf, probability
+    chi2, ndf, probability : float
         Weighted squares of all residuals, degrees of freedom, and the chance of a larger chi2 if
-        everything is as described.
+        everything is as described. Not always a whole number of degrees of freedom: turned bodies
+        let readings feel a little of motions that are otherwise unmeasured.
     checks : tuple of Check
     outliers : tuple of Outlier
         In the order in which they were found.
@@ -123,7 +124,7 @@ class Adjustment:
     from_prior: NDArray[np.bool_]
     unmeasured: tuple[Unmeasured, ...]
     chi2: float
-    ndf: int
+    ndf: float
     probability: float
     checks: tuple[Check, ...]
     outliers: tuple[Outlier, ...]
