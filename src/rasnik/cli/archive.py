@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rasnik.cli.archive_summary import archive_summary_command
 from rasnik.cli.common import fail, load
 from rasnik.io.folders import is_url
 
@@ -24,12 +25,11 @@ archive_app = typer.Typer(
 )
 
 
-@archive_app.command("analyse")
 def analyse_archive_command(
     sources: Annotated[
         list[str],
         typer.Argument(
-            metavar="SRC...",
+            metavar="SRC",
             help="Folders, searched to any depth, files, or URLs (s3://, zip://).",
             show_default=False,
         ),
@@ -158,3 +158,7 @@ def _table(systems: Path | None, system: str | None, settings: list[str] | None)
         return SystemsTable.read(systems, default)
     except (SystemConfigError, ImportError) as error:
         fail(f"{error}.")
+
+
+archive_app.command("analyse")(analyse_archive_command)
+archive_app.command("summary")(archive_summary_command)
