@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from rasnik import analyse
 from rasnik.geometry.reading import (
     FACING,
     MOTIONS,
@@ -19,7 +20,9 @@ from rasnik.geometry.reading import (
     reading,
     readings,
 )
+from rasnik.imaging.montecarlo import exact_image
 from rasnik.imaging.projection import ORIENTATIONS
+from rasnik.instrument import load_system
 
 A_MM, B_MM = 60.0, 90.0  # scale 1.5
 MASK = Placement([0, 0, 0], np.eye(3))
@@ -243,3 +246,17 @@ def test_one_that_cannot_be_read_does_not_stop_the_others() -> None:
     assert readings(MASK, LENS, SENSOR, 2, allow_missing=True)[1] == 0
     with pytest.raises(ValueError, match="lens is not between"):
         readings(MASK, lenses, SENSOR)
+
+
+def test_an_image_of_tilted_elements_is_analysed_to_the_same_reading() -> None:
+    system = load_system("solidras", ["sensor.width_px=360", "sensor.height_px=270"])
+    mask = Placement([-5.0, -6.0, 0], turn([0.0, 0.04, 0.01]))
+    sensor = Placement([0.2, -0.1, 126.0], turn([0.03, 0, 0]) @ FACING)
+    expected = reading(mask, LENS, sensor)
+    image = exact_image(system, projection(mask, LENS, sensor))
+    found = analyse(image, system, model="projective")
+    assert found.ok and found.orientation == expected.orientation
+    # frames without noise: what is left is the tolerance of generator and fit
+    assert (found.x_um, found.y_um) == pytest.approx((expected.x_um, expected.y_um), abs=2e-4)
+    assert found.scale == pytest.approx(expected.scale, abs=2e-7)
+    assert found.theta_rad == pytest.approx(expected.theta_rad, abs=2e-7)
