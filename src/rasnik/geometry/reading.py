@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rasnik.geometry.rigid import UM_PER_MM
 from rasnik.imaging.projection import ORIENTATIONS, Projection
 
 __all__ = [
@@ -49,7 +50,6 @@ MOTIONS = (
     *(f"sensor_{kind}" for kind in ("x", "y", "z", "turn_x", "turn_y", "turn_z")),
 )
 
-_UM_PER_MM = 1e3
 # Below this cosine a ray runs along the mask, and where it crosses it says nothing.
 _GRAZING = 1e-9
 
@@ -175,7 +175,7 @@ def readings(
     scale = 1 / np.sqrt(np.abs(_determinant(jacobian)))
     theta = np.arctan2(across, along)
     theta = np.where(theta == -np.pi, np.pi, theta)
-    values = np.stack([*np.moveaxis(_UM_PER_MM * point, -1, 0), scale, theta], axis=-1)
+    values = np.stack([*np.moveaxis(UM_PER_MM * point, -1, 0), scale, theta], axis=-1)
     return np.where(codes[..., None] > 0, values, np.nan), codes
 
 
@@ -212,7 +212,7 @@ def derivatives(
     depth = (P - L)[..., 2:]
     t = L[..., 2:] / depth  # object distance / image distance
     dt = (d_lens[..., 2:] * P[..., 2:] - L[..., 2:] * d_centre[..., 2:]) / depth**2
-    d_point = _UM_PER_MM * (d_lens + dt * (L - P) + t * (d_lens - d_centre))
+    d_point = UM_PER_MM * (d_lens + dt * (L - P) + t * (d_lens - d_centre))
     slope = (L - P) / depth
     d_slope = ((d_lens - d_centre) - slope * (d_centre - d_lens)[..., 2:]) / depth
     fan = A[..., :2, :] + slope[..., :2, None] * A[..., 2:, :]
@@ -244,10 +244,10 @@ def projection(mask: Placement, lens_mm: ArrayLike, sensor: Placement) -> Projec
     """
     lens, centre, axes = _checked(*_in_mask(mask, lens_mm, sensor), allow_missing=False)
     # columns: what u, v (um) and 1 contribute to the sensor's point, in mm
-    columns = np.column_stack([axes / _UM_PER_MM, centre])
+    columns = np.column_stack([axes / UM_PER_MM, centre])
     numerators = np.outer(lens, columns[2]) - lens[2] * columns
     denominator = columns[2] - [0.0, 0.0, lens[2]]
-    return Projection(np.vstack([_UM_PER_MM * numerators[:2], denominator]))
+    return Projection(np.vstack([UM_PER_MM * numerators[:2], denominator]))
 
 
 def _in_mask(mask: Placement, lens_mm: ArrayLike, sensor: Placement) -> tuple[Array, Array, Array]:
@@ -373,7 +373,7 @@ def _motions(mask: Placement, lens_mm: ArrayLike, sensor: Placement) -> tuple[Ar
     d_lens, d_centre = np.zeros((*shape, 15, 3)), np.zeros((*shape, 15, 3))
     d_axes = np.zeros((*shape, 15, 3, 2))
     for k, unit in enumerate(np.eye(3)):
-        shift = back[..., :, k] / _UM_PER_MM
+        shift = back[..., :, k] / UM_PER_MM
         d_lens[..., k, :] = d_centre[..., k, :] = -shift
         d_lens[..., 6 + k, :] = d_centre[..., 9 + k, :] = shift
         # a turn of the mask turns all the rest the other way

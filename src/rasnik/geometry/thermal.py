@@ -18,14 +18,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rasnik.geometry.effects import Effect
+from rasnik.geometry.rigid import UM_PER_MM
 from rasnik.geometry.three_points import ThreePoints
 
 __all__ = ["SILICON_PER_K", "Expansion", "holder_effect", "mask_effect", "sensor_effect"]
 
 #: Expansion of a sensor's silicon, 1/K: van der Graaf et al., "Temperature effects".
 SILICON_PER_K = 2.6e-6
-
-_UM_PER_MM = 1e3
 
 
 @dataclass(frozen=True)
@@ -143,7 +142,7 @@ def holder_effect(
     length = np.asarray(length_mm, dtype=np.float64)
     if length.shape != (3,):
         raise ValueError("length_mm needs three numbers: along X, along Y, along the light")
-    slope = instrument.matrix([f"{element}_{axis}" for axis in "xyz"]) @ (_UM_PER_MM * length)
+    slope = instrument.matrix([f"{element}_{axis}" for axis in "xyz"]) @ (UM_PER_MM * length)
     cause = f"holder of the {element}"
     return _effect(cause, expansion.strain * slope, slope, expansion.sigma_strain)
 

@@ -56,6 +56,11 @@ ALL_MOTIONS = MOTIONS + CAMERA_MOTIONS
 # allows as much.
 _SCALE_TOLERANCE = 0.1
 
+# Where the motions of each body stand in ALL_MOTIONS; those of an element are so in MOTIONS too.
+_MASK_SHIFT, _MASK_TURN, _LENS_SHIFT = slice(0, 3), slice(3, 6), slice(6, 9)
+_SENSOR_SHIFT, _SENSOR_TURN = slice(9, 12), slice(12, 15)
+_CAMERA_SHIFT, _CAMERA_TURN = slice(15, 18), slice(18, 21)
+
 
 def motion_unit(name: str) -> str:
     """``"um"`` or ``"rad"``: the unit of a motion."""
@@ -136,10 +141,10 @@ class ThreePoints:
         vector = np.zeros(len(ALL_MOTIONS))
         for name, value in motions.items():
             vector[motion_index(name)] = value
-        placed, centre = self._placed(vector)
-        (x, y, scale, theta), code = readings(*placed, self.orientation)
-        x0, y0 = centre
-        return Reading(float(x + x0), float(y + y0), float(scale), float(theta), int(code))
+        (x, y, scale, theta), code = readings(*self._placed(vector), self.orientation)
+        return Reading(
+            float(x + self.x_um), float(y + self.y_um), float(scale), float(theta), int(code)
+        )
 
     def values(self, motions: ArrayLike) -> Array:
         """What is read after each of many sets of motions.
@@ -154,9 +159,9 @@ class ThreePoints:
         ndarray, shape (..., 4)
             x (um), y (um), S, theta_z (rad); NaN where nothing can be read.
         """
-        placed, centre = self._placed(np.asarray(motions, dtype=np.float64))
+        placed = self._placed(np.asarray(motions, dtype=np.float64))
         found, _ = readings(*placed, self.orientation, allow_missing=True)
-        found[..., :2] += centre
+        found[..., :2] += [self.x_um, self.y_um]
         return found
 
     def slopes(self, motions: ArrayLike) -> Array:
@@ -172,7 +177,7 @@ class ThreePoints:
             Per um and rad; exact.
         """
         vector = np.asarray(motions, dtype=np.float64)
-        placed, _ = self._placed(vector)
+        placed = self._placed(vector)
         by_element = derivatives(*placed, self.orientation, allow_missing=True)
         return by_element @ self._chain(vector, placed)
 
@@ -250,43 +255,44 @@ class ThreePoints:
         c, s = math.cos(self.theta_rad), math.sin(self.theta_rad)
         return np.array([[-dx * c, dx * s, 0.0], [-dy * s, -dy * c, 0.0], [0.0, 0.0, dx * dy]])
 
-    def _placed(self, motions: Array) -> tuple[tuple[Placement, Array, Placement], Array]:
-        """The elements in the world, and the mask's point that stands for its origin."""
-        mm = motions[..., [0, 1, 2, 6, 7, 8, 9, 10, 11, 15, 16, 17]] / UM_PER_MM
-        d_mask, d_lens, d_sensor, d_camera = (
-            mm[..., 3 * k : 3 * k + 3] * self._along for k in range(4)
-        )
+    def _placed(self, motions: Array) -> tuple[Placement, Array, Placement]:
+        """The elements in the world; its origin is the mask's point on the line as built."""
+
+        def shift(which: slice) -> Array:
+            return motions[..., which] / UM_PER_MM * self._along
+
         z = self._along * [0.0, 0.0, 1.0]
         pivot = self._pivot_mm() * z
-        camera = rotation_matrix(motions[..., 18:21])
+        camera = rotation_matrix(motions[..., _CAMERA_TURN])
 
         def carried(point: Array) -> Array:
-            return (camera @ (point - pivot)[..., None])[..., 0] + pivot + d_camera
+            arm = camera @ (point - pivot)[..., None]
+            return np.asarray(arm[..., 0] + pivot + shift(_CAMERA_SHIFT))
 
-        lens = carried(self.mask_lens_mm * z + d_lens)
-        sensor = carried((self.mask_lens_mm + self.lens_sensor_mm) * z + d_sensor)
-        axes = camera @ rotation_matrix(motions[..., 12:15]) @ self._sensor_axes
-        mask = Placement(d_mask, rotation_matrix(motions[..., 3:6]))
-        return (mask, lens, Placement(sensor, axes)), np.array([self.x_um, self.y_um])
+        length = self.mask_lens_mm + self.lens_sensor_mm
+        mask = Placement(shift(_MASK_SHIFT), rotation_matrix(motions[..., _MASK_TURN]))
+        lens = carried(self.mask_lens_mm * z + shift(_LENS_SHIFT))
+        axes = camera @ rotation_matrix(motions[..., _SENSOR_TURN]) @ self._sensor_axes
+        return mask, lens, Placement(carried(length * z + shift(_SENSOR_SHIFT)), axes)
 
     def _chain(self, motions: Array, placed: tuple[Placement, Array, Placement]) -> Array:
         """d(motion of each element in the world) / d(motions), shape (..., 15, 21)."""
         _, lens, sensor = placed
         chain = np.zeros((*motions.shape[:-1], len(MOTIONS), len(ALL_MOTIONS)))
         along = np.diag(self._along)
-        camera = rotation_matrix(motions[..., 18:21])
-        turned = left_jacobian(motions[..., 18:21])
-        centre = self._pivot_mm() * self._along * [0.0, 0.0, 1.0]
-        centre = centre + motions[..., 15:18] / UM_PER_MM * self._along
-        chain[..., 0:3, 0:3] = along
-        chain[..., 3:6, 3:6] = left_jacobian(motions[..., 3:6])
-        chain[..., 6:9, 6:9] = chain[..., 9:12, 9:12] = camera @ along
-        chain[..., 12:15, 12:15] = camera @ left_jacobian(motions[..., 12:15])
-        chain[..., 6:9, 15:18] = chain[..., 9:12, 15:18] = along
-        for rows, point in ((slice(6, 9), lens), (slice(9, 12), sensor.position_mm)):
-            arm = UM_PER_MM * (point - centre)
-            chain[..., rows, 18:21] = -skew(arm) @ turned
-        chain[..., 12:15, 18:21] = turned
+        camera = rotation_matrix(motions[..., _CAMERA_TURN])
+        turned = left_jacobian(motions[..., _CAMERA_TURN])
+        pivot = self._pivot_mm() * self._along * [0.0, 0.0, 1.0]
+        pivot = pivot + motions[..., _CAMERA_SHIFT] / UM_PER_MM * self._along
+        chain[..., _MASK_SHIFT, _MASK_SHIFT] = along
+        chain[..., _MASK_TURN, _MASK_TURN] = left_jacobian(motions[..., _MASK_TURN])
+        sensor_turn = camera @ left_jacobian(motions[..., _SENSOR_TURN])
+        chain[..., _SENSOR_TURN, _SENSOR_TURN] = sensor_turn
+        chain[..., _SENSOR_TURN, _CAMERA_TURN] = turned
+        for rows, point in ((_LENS_SHIFT, lens), (_SENSOR_SHIFT, sensor.position_mm)):
+            chain[..., rows, rows] = camera @ along
+            chain[..., rows, _CAMERA_SHIFT] = along
+            chain[..., rows, _CAMERA_TURN] = -skew(UM_PER_MM * (point - pivot)) @ turned
         return chain
 
 
