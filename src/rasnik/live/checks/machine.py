@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator
 
 from rasnik.live.checks.finding import NOT_KNOWN, Finding, Machine
+from rasnik.live.priority import NICE, REAL_TIME
 from rasnik.live.station import StationConfig
 
 __all__ = [
@@ -76,16 +77,16 @@ def governor(machine: Machine) -> Iterator[Finding]:
 
 
 def priority(machine: Machine) -> Iterator[Finding]:
-    """Whether this user may run a program before others."""
+    """Whether a station of this user runs before other programs, as `before_others` wants it."""
     realtime, nice = _limit(machine, "realtime priority"), _limit(machine, "nice priority")
     if realtime is None or nice is None:
         yield Finding(
             "priority", "note", NOT_KNOWN, "Let nothing else that computes run on this machine."
         )
-    elif _has_capability(machine, _CAP_SYS_NICE) or realtime > 0:
-        yield Finding("priority", "ok", "may be raised, real time included")
+    elif _has_capability(machine, _CAP_SYS_NICE) or realtime >= REAL_TIME:
+        yield Finding("priority", "ok", "may be raised: real time where cores suffice")
     elif nice > 20:  # 20 - nice is the limit's number
-        yield Finding("priority", "ok", f"may be raised to nice {20 - nice:.0f}")
+        yield Finding("priority", "ok", f"may be raised to nice {max(NICE, 20 - nice):.0f}")
     else:
         yield Finding(
             "priority",
