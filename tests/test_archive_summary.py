@@ -143,9 +143,9 @@ def test_known_scatter_and_drift_come_back(tmp_path: Path, rng: np.random.Genera
 
 def test_stated_error_of_the_scatter(tmp_path: Path, rng: np.random.Generator) -> None:
     pulls = []
-    for run in range(60):
-        write_rows(tmp_path / str(run), "A", 2e-3 * rng.normal(size=400))
-        one = summarise(tmp_path / str(run)).instruments[0].scatter["x"]
+    for number in range(60):
+        write_rows(tmp_path / str(number), "A", 2e-3 * rng.normal(size=400))
+        one = summarise(tmp_path / str(number)).instruments[0].scatter["x"]
         pulls.append((one.sigma - 2.0) / one.sigma_error)
     assert 0.7 < np.std(pulls) < 1.3
 
@@ -253,13 +253,9 @@ def test_names_of_instruments_are_read_back(tmp_path: Path) -> None:
 
 
 def run(*arguments: str) -> Any:
-    import typer
+    from rasnik.cli import app
 
-    from rasnik.cli.archive_summary import archive_summary_command
-
-    app = typer.Typer(rich_markup_mode="rich")
-    app.command("summary")(archive_summary_command)
-    return CliRunner().invoke(app, list(arguments), catch_exceptions=False)
+    return CliRunner().invoke(app, ["archive", "summary", *arguments], catch_exceptions=False)
 
 
 def test_command_helps() -> None:
@@ -285,10 +281,11 @@ def test_command_writes_a_report_with_pictures(tmp_path: Path, rng: np.random.Ge
     data = tmp_path / "data"
     write_rows(data, "A<b>", x, file=names, chi2_ndf=chi2, toml=system.to_toml())
     result = run(str(data), "-o", str(tmp_path / "report"))
-    assert result.exit_code == 1  # an image without a position
+    assert result.exit_code == 0
     assert "60 images, 59 with a position; without: 1 no_mask" in result.output
     page = (tmp_path / "report" / "summary.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") == 3  # overview and two overlays
+    assert (tmp_path / "report" / "overview.png").read_bytes().startswith(b"\x89PNG")
     assert "A&lt;b&gt;" in page and "A<b>" not in page
     assert "no such file" in page  # of the failure, which is gone
     assert "http" not in page.replace("http-equiv", "")
@@ -307,6 +304,14 @@ def test_command_prints_json(tmp_path: Path) -> None:
     assert one["images"] == 5 and one["resolution_nm"]["x"] is None
     assert one["drift_um_per_day"]["x"]["slope"] is None
     assert document["worst"] == [] and document["faults"] == []
+
+
+def test_command_tells_of_damaged_parts(tmp_path: Path) -> None:
+    write_rows(tmp_path, "A", np.zeros(5))
+    write_rows(tmp_path, "A", np.zeros(5), name="part-1").write_text("damaged")
+    result = run(str(tmp_path))
+    assert result.exit_code == 1
+    assert "a part cannot be read" in result.output and "part-1.parquet" in result.output
 
 
 def test_command_refuses_what_is_no_dataset(tmp_path: Path) -> None:

@@ -31,15 +31,15 @@ def archive_summary_command(
             "--output",
             "-o",
             metavar="FOLDER",
-            help="Write summary.html, with pictures of the worst images, and instruments.csv.",
+            help="Write summary.html, with pictures of the worst images, overview.png and "
+            "instruments.csv.",
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="JSON.")] = False,
 ) -> None:
     """Resolution, drift, failures and the worst images of all instruments of an archive.
 
-    Exit status: 0 all is well, 1 images without a position or faults in the dataset, 2 wrong
-    usage.
+    Exit status: 0 the whole dataset was read, 1 parts of it are damaged, 2 wrong usage.
 
     [bold]Examples[/]
 
@@ -65,7 +65,7 @@ def archive_summary_command(
         _print(found)
     if folder is not None:
         _write(folder, found, document, quiet=as_json)
-    raise typer.Exit(1 if found.failed or found.faults else 0)
+    raise typer.Exit(1 if found.faults else 0)
 
 
 def _progress() -> Any:
@@ -144,17 +144,19 @@ def _print(found: Summary) -> None:
 
 
 def _write(folder: Path, found: Summary, document: dict[str, Any], *, quiet: bool) -> None:
-    from rasnik.report.archive import write_archive_page, write_archive_table
+    from rasnik.report.archive import draw_overview, write_archive_page, write_archive_table
 
     try:
         folder.mkdir(parents=True, exist_ok=True)
         pictures = [_picture(worst) for worst in found.worst]
-        write_archive_page(folder / "summary.html", document, pictures)
+        overview = draw_overview(document)
+        (folder / "overview.png").write_bytes(overview)
+        write_archive_page(folder / "summary.html", document, overview, pictures)
         write_archive_table(folder / "instruments.csv", document)
     except OSError as error:
         fail(f"{folder} cannot be written: {error.strerror or error}.")
     if not quiet:
-        for name in ("summary.html", "instruments.csv"):
+        for name in ("summary.html", "overview.png", "instruments.csv"):
             output().print(f"written: {folder / name}", markup=False)
 
 

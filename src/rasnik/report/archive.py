@@ -23,7 +23,13 @@ from matplotlib.figure import Figure
 from rasnik import __version__
 from rasnik.report.numbers import with_sigma
 
-__all__ = ["Picture", "archive_figure", "write_archive_page", "write_archive_table"]
+__all__ = [
+    "Picture",
+    "archive_figure",
+    "draw_overview",
+    "write_archive_page",
+    "write_archive_table",
+]
 
 Document = Mapping[str, Any]
 
@@ -93,6 +99,13 @@ def archive_figure(document: Document) -> Figure:
     for axes in (ratio, moved, failed):
         _name_instruments(axes, [one["instrument"] for one in instruments])
     return figure
+
+
+def draw_overview(document: Document) -> bytes:
+    """The figure as a PNG."""
+    sink = io.BytesIO()
+    archive_figure(document).savefig(sink, format="png")
+    return sink.getvalue()
 
 
 def _points(axes: Axes, name: str, values: Sequence[Any], errors: Sequence[Any]) -> None:
@@ -251,7 +264,10 @@ def write_archive_table(path: str | os.PathLike[str], document: Document) -> Non
 
 
 def write_archive_page(
-    path: str | os.PathLike[str], document: Document, pictures: Sequence[Picture]
+    path: str | os.PathLike[str],
+    document: Document,
+    overview: bytes,
+    pictures: Sequence[Picture],
 ) -> None:
     """Write the report as one HTML file that needs no other.
 
@@ -260,6 +276,8 @@ def write_archive_page(
     path : path-like
     document : mapping
         As of ``rasnik archive summary --json``.
+    overview : bytes
+        PNG by `draw_overview`.
     pictures : sequence of Picture
         The worst images.
 
@@ -268,14 +286,12 @@ def write_archive_page(
     OSError
         If the file cannot be written.
     """
-    sink = io.BytesIO()
-    archive_figure(document).savefig(sink, format="png")
     parts = [
         "<h1>Summary of an archive</h1>",
         f'<p class="soft">{_text(document["dataset"])}</p>',
         _headline(document),
         _listed("Faults of the dataset", document["faults"], "faults"),
-        f"<figure>{_image(sink.getvalue(), 'overview')}</figure>",
+        f"<figure>{_image(overview, 'overview')}</figure>",
         "<h2>Images to look at</h2>",
         *([_picture(one) for one in pictures] or ["<p>No image stands out.</p>"]),
         "<h2>Instruments</h2>",
