@@ -367,7 +367,7 @@ def test_station_xml_that_cannot_be():
 
 def test_export_writes_both_files(tmp_path):
     write_track(track_of(missing=[7]), tmp_path / "track.csv")
-    (tmp_path / "mass.toml").write_text("frequency_hz = 0.8\nq = 2.0\n")
+    (tmp_path / "mass.toml").write_text("[suspension]\nfrequency_hz = 0.8\nq = 2.0\n")
     command = ("export", tmp_path / "track.csv", "-o", tmp_path / "a.mseed", "--station", "RAS1")
     result = rasnik(
         *command, "--suspension", tmp_path / "mass.toml", "--channel", "x=90",
@@ -381,9 +381,10 @@ def test_export_writes_both_files(tmp_path):
     np.testing.assert_allclose(x.values[keep], 1e3 * track_of(missing=[7]).x_um, rtol=1e-14)
     np.testing.assert_allclose(y.values[keep], 1e3 * track_of(missing=[7]).y_um, rtol=1e-14)
     assert "exists already" in refused(*command)
-    again = rasnik(*command, "--overwrite", "--frequency", "0.8", "--q", "2", "--count-nm", "0.1")
-    assert again.exit_code == 0
-    assert obspy_read(tmp_path / "a.mseed")[0].id == "XX.RAS1..SH1"
+    camera = ("--frequency", "0.8", "--q", "2", "--on-mass", "camera", "--count-nm", "0.1")
+    assert rasnik(*command, "--overwrite", *camera).exit_code == 0
+    (trace, *_) = obspy_read(tmp_path / "a.mseed").select(id="XX.RAS1..SH1")
+    np.testing.assert_allclose(trace.data[:7], -1e4 * track_of().x_um[:7], atol=0.5)
 
 
 @pytest.mark.parametrize(
@@ -391,7 +392,7 @@ def test_export_writes_both_files(tmp_path):
     [
         ((), "needs the code of a station: --station"),
         (("--station", "toolong"), "station code 'toolong' should be"),
-        (("--station", "A", "--frequency", "1"), "--frequency and --q go together"),
+        (("--station", "A", "--frequency", "1"), "q is missing: give it, or a file"),
         (("--station", "A", "--frequency", "-1", "--q", "2"), "frequency_hz = -1.0"),
         (("--station", "A", "--stationxml", "x.xml"), "needs the place of the station: --place"),
         (("--station", "A", "--place", "1"), "has 1 numbers"),

@@ -12,6 +12,7 @@ from rasnik.cli import export_seismic as seismic
 from rasnik.cli.common import fail, messages
 from rasnik.cli.export_results import export_icaras, export_results, track_or_results
 from rasnik.cli.export_seismic import SeismicOptions, export_seismic
+from rasnik.cli.seismic_options import FileOption, FrequencyOption, OnMassOption, QOption
 
 __all__ = ["export_command"]
 
@@ -41,9 +42,10 @@ def export_command(
     station: seismic.StationOption = None,
     location: seismic.LocationOption = "",
     channels: seismic.ChannelOption = None,
-    suspension: seismic.SuspensionOption = None,
-    frequency: seismic.FrequencyOption = None,
-    q: seismic.QOption = None,
+    suspension: FileOption = None,
+    frequency: FrequencyOption = None,
+    q: QOption = None,
+    on_mass: OnMassOption = None,
     stationxml: seismic.StationXmlOption = None,
     place: seismic.PlaceOption = None,
     count_nm: seismic.CountOption = None,
@@ -74,8 +76,8 @@ def export_command(
     if output.exists() and not overwrite:
         fail(f"{output} exists already; give another name, or --overwrite to replace it.")
     options = SeismicOptions(
-        network, station, location, channels, suspension, frequency, q, stationxml, place,
-        count_nm, start, exposure,
+        network, station, location, channels, suspension, frequency, q, on_mass, stationxml,
+        place, count_nm, start, exposure,
     )  # fmt: skip
     is_seismic = output.suffix.lower() in MINISEED_SUFFIXES
     if options.given and not is_seismic:

@@ -11,6 +11,7 @@ import typer
 
 from rasnik.cli.common import fail, numbers
 from rasnik.cli.files import system_for
+from rasnik.cli.seismic_options import OnMass
 
 if TYPE_CHECKING:
     from rasnik.io.seed_codes import Direction, Site
@@ -44,25 +45,6 @@ ChannelOption = Annotated[
         "down. Repeatable; by default x and y, directions unknown.",
         rich_help_panel=_PANEL,
     ),
-]
-SuspensionOption = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE", help="TOML file of the proof mass's suspension.", rich_help_panel=_PANEL
-    ),
-]
-FrequencyOption = Annotated[
-    float | None,
-    typer.Option(
-        "--frequency",
-        metavar="HZ",
-        help="Natural frequency of the proof mass, in place of a file.",
-        rich_help_panel=_PANEL,
-    ),
-]
-QOption = Annotated[
-    float | None,
-    typer.Option("--q", metavar="Q", help="Its quality factor.", rich_help_panel=_PANEL),
 ]
 StationXmlOption = Annotated[
     Path | None,
@@ -120,6 +102,7 @@ class SeismicOptions:
     suspension: Path | None
     frequency_hz: float | None
     q: float | None
+    on_mass: OnMass | None
     stationxml: Path | None
     place: str | None
     count_nm: float | None
@@ -129,8 +112,7 @@ class SeismicOptions:
     @property
     def given(self) -> bool:
         """Whether any was given that only miniSEED knows."""
-        plain = SeismicOptions("XX", None, "", None, None, None, None, None, None, None, None, None)
-        return self != plain
+        return self != SeismicOptions("XX", None, "", *[None] * 10)
 
 
 def export_seismic(
@@ -208,26 +190,13 @@ def _directions(texts: list[str] | None) -> dict[str, Direction | None]:
 
 
 def _suspension(options: SeismicOptions) -> Suspension | None:
-    from pydantic import ValidationError
+    from rasnik.cli.seismic_options import suspension_of
 
-    from rasnik._config import SystemConfigError, read_toml, sentences
-    from rasnik.seismic.suspension import Suspension
-
-    values: dict[str, Any]
-    if options.suspension is not None:
-        if options.frequency_hz is not None or options.q is not None:
-            fail("--suspension and --frequency, --q exclude each other: the file has both.")
-        label, values = str(options.suspension), read_toml(options.suspension)
-    elif options.frequency_hz is None and options.q is None:
+    given = options.suspension, options.frequency_hz, options.q, options.on_mass
+    if all(one is None for one in given):
         return None
-    elif options.frequency_hz is None or options.q is None:
-        fail("--frequency and --q go together: give both, or a --suspension file.")
-    else:
-        label, values = "suspension", {"frequency_hz": options.frequency_hz, "q": options.q}
-    try:
-        return Suspension.model_validate(values)
-    except ValidationError as error:
-        raise SystemConfigError(label, sentences(Suspension, error)) from None
+    path, frequency_hz, q, on_mass = given
+    return suspension_of(path, frequency_hz, q, None, None, on_mass, None)
 
 
 def _start_s(text: str | None) -> float | None:
