@@ -140,14 +140,14 @@ def motions_study(name: str, trials: int, seed: int) -> bool:
 # ------------------------------------------------------------------ wrong readings
 
 
-def wrong_study(name: str, trials: int, seed: int) -> bool:
+def wrong_study(name: str, sizes: list[float], trials: int, seed: int) -> bool:
     network = tower(name)
     sigmas, design = sigmas_of(network), capability(network).checks
     print(f"== {name}: one wrong value, {trials} trials each")
     heads = ("named", "one of several", "another alone", "only chi2", "silent")
     print(f"{'error / detectable':>20}" + "".join(f"{head:>16}" for head in heads))
     silent = 0
-    for size in (1.0, 1.5, 3.0, 10.0):
+    for size in sizes:
         counts = dict.fromkeys(heads, 0)
         for k in range(trials):
             rng = np.random.default_rng([seed, 2, k])
@@ -221,6 +221,10 @@ def main() -> None:
     parser.add_argument("--epochs", type=int, default=12, help="of twelve images; 0 for none")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", choices=["motions", "wrong", "images"])
+    parser.add_argument(
+        "--sizes", type=float, nargs="+", default=[1.0, 1.5, 3.0, 10.0],
+        help="errors of wrong values, in detectable ones",
+    )  # fmt: skip
     parser.add_argument("--tower", choices=TOWERS, help="default both")
     options = parser.parse_args()
     towers = [options.tower] if options.tower else TOWERS
@@ -231,7 +235,9 @@ def main() -> None:
             good[f"{name}: motions"] = motions_study(name, options.trials, options.seed)
     if options.only in (None, "wrong"):
         for name in towers:
-            good[f"{name}: wrong values"] = wrong_study(name, options.trials, options.seed)
+            good[f"{name}: wrong values"] = wrong_study(
+                name, options.sizes, options.trials, options.seed
+            )
     if options.only in (None, "images") and options.epochs:
         good["atlas-tower: images"] = image_study(options.epochs, options.seed)
     for name, is_good in good.items():

@@ -249,10 +249,7 @@ def test_the_whole_installation_and_a_body_that_nothing_measures() -> None:
     shapes = ["shear, along x", "shear, along y", "stretch, along z"]
     assert words(found) == [
         "the whole installation: all six degrees of freedom",
-        *(
-            f"inner and outer: {shape} in proportion to their distance in z"
-            for shape in shapes
-        ),
+        *(f"inner and outer: {shape} in proportion to their distance in z" for shape in shapes),
     ]
     assert not found.measured.any()
     assert found.ndf == 48 - (18 - 9)
@@ -433,6 +430,16 @@ def test_a_reading_that_no_place_explains() -> None:
     network = camera(held=["x", "y", "rx", "ry", "rz"])
     found = adjust(network, readings([[0.0, 0.0, 1e6, 0.0]]))
     assert not found.converged and not found.consistent
+
+
+def test_motions_beyond_belief() -> None:
+    """Absolute readings of a mask whose origin nobody described."""
+    network = camera(held=["rx", "ry"])
+    found = adjust(network, readings([[80e3, 0.0, 0.25, 0.0]]))
+    (problem,) = found.problems
+    assert "mask would have moved by -80 mm along x, but is believed to stay within 10" in problem
+    assert not found.complete
+    assert not adjust(network, readings([[20e3, 0.0, 0.25, 0.0]])).problems
 
 
 def test_as_dict_is_plain(tower: Network, rng: np.random.Generator) -> None:

@@ -220,7 +220,7 @@ def _print_fit(found: Adjustment) -> None:
     from rasnik.geometry.solution import LEAST_PROBABILITY
 
     console = output()
-    if found.ndf:
+    if math.isfinite(found.probability):
         text = f"chi2 {found.chi2:.1f} for {found.ndf:.3g} degrees of freedom"
         likely = not found.probability < LEAST_PROBABILITY
         style = None if likely else "red"

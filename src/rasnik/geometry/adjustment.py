@@ -28,6 +28,10 @@ Array = NDArray[np.float64]
 _CONVERGED = 1e-3
 _POLISHING_STEPS = 3
 _TOLERANCE = 1e-6
+# Fewer degrees of freedom say nothing about chi2.
+_LEAST_NDF = 0.5
+# Ranges beyond which a motion contradicts what was believed.
+_BEYOND = 3.0
 # Misfit of a trial that is to be turned down, in standard deviations.
 _INTERRUPTED = 1e100
 # A posterior error within this factor of the prior comes from the prior.
@@ -328,14 +332,34 @@ def _result(
         tuple(name_motions(network, free, fit.space, fit.ranges, np.asarray(fit.used.any(axis=1)))),
         squares,
         ndf,
-        float(chi2.sf(squares, ndf)) if ndf else np.nan,
+        float(chi2.sf(squares, ndf)) if ndf >= _LEAST_NDF else np.nan,
         checks,
         tuple(outliers),
         sagitta,
-        tuple(problems),
+        (*problems, *_beyond_range(fit)),
         fit.converged,
         estimate,
     )
+
+
+def _beyond_range(fit: _Fit) -> list[str]:
+    """Motions that nobody believed in: readings then mean something else."""
+    far = np.flatnonzero(np.abs(fit.parameters) > _BEYOND)
+    if not len(far):
+        return []
+    installation = fit.network.installation
+    worst = far[np.argmax(np.abs(fit.parameters[far]))]
+    b, d = np.argwhere(fit.free)[worst]
+    value = fit.parameters[worst] * fit.ranges[worst]
+    told = f"{value / UM_PER_MM:.4g} mm along" if d < 3 else f"{1e3 * value:.4g} mrad about"
+    believed = (
+        f"{installation.range_mm:g} mm" if d < 3 else f"{1e3 * installation.range_rad:g} mrad"
+    )
+    return [
+        f"{fit.network.bodies[b]} would have moved by {told} {'xyz'[d % 3]}, but is believed to "
+        f"stay within {believed}: give reference readings, or the mask.point_um of every Rasnik, "
+        f"or a larger range"
+    ]
 
 
 def _checks(fit: _Fit, offered: NDArray[np.bool_]) -> tuple[Check, ...]:

@@ -110,7 +110,7 @@ class Adjustment:
         In the order in which they were found.
     sagittas : tuple of SagittaResult
     problems : tuple of str
-        What could not be used.
+        What could not be used, or cannot be believed.
     converged : bool
     estimate : ndarray, shape (bodies, 6)
         The solution that residuals belong to, unmeasured motions near zero; for drawing.

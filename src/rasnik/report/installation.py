@@ -65,7 +65,7 @@ def _title(found: Adjustment, has_data: bool) -> str:
     if not has_data:
         return f"{name}: what one reading of each Rasnik tells"
     text = f"{name}: motions from {len(found.checks)} values"
-    if found.ndf:
+    if np.isfinite(found.probability):
         text += f"; chi2 {found.chi2:.1f} for {found.ndf:.3g} degrees of freedom"
     wrong = [f"{one.value} of {one.rasnik}" for one in found.outliers]
     return text + (f"; wrong: {', '.join(wrong)}" if wrong else "")
