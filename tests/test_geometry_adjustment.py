@@ -174,7 +174,7 @@ def test_errors_by_monte_carlo(rng: np.random.Generator) -> None:
     motions = np.zeros((3, 6))
     motions[1:] = rng.normal(size=(2, 6)) * [1000, 1000, 1000, 1e-3, 1e-3, 1e-3]
     exact = network.values(motions)
-    n = 60
+    n = 40
     results = [
         adjust(network, readings(exact + sigmas * rng.normal(size=exact.shape))) for _ in range(n)
     ]
@@ -392,7 +392,7 @@ def test_rate_of_detection(rng: np.random.Generator) -> None:
     span = np.linalg.qr(design)[0]
     tested = np.ones(12, dtype=bool)
     size = snoop(span, np.zeros(12), tested).detectable[5]
-    n = 2000
+    n = 1000
     named = alarms = 0
     for _ in range(n):
         noise = rng.normal(size=12)
