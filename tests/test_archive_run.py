@@ -227,7 +227,7 @@ def main():
             killed[0].kill()
         if os.environ.get("KILL_ALL") and progress.images >= 6:
             os.kill(os.getpid(), signal.SIGKILL)
-    with Dataset(Path(sys.argv[2])) as dataset, dask_pool(2, system=SMALL) as pool:
+    with Dataset(Path(sys.argv[2])) as dataset, dask_pool(1, system=SMALL) as pool:
         run = ArchiveRun([sys.argv[1]], SystemsTable.for_all(SMALL), dataset,
                          limits=Limits(frames=3))
         run.run(pool, kill_a_worker)
@@ -238,6 +238,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_killed_workers_and_a_killed_run(tmp_path):
     """A program of its own, whose worker is killed; then all of it; then it goes on."""
     for name in ("a", "b"):

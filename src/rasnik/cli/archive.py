@@ -35,7 +35,7 @@ def analyse_archive_command(
         ),
     ],
     dataset: Annotated[
-        Path,
+        str,
         typer.Option(
             "--output",
             "-o",
@@ -129,7 +129,7 @@ def analyse_archive_command(
         fail("--workers starts processes here, --scheduler uses those there are; give one of them.")
     if system is None and settings:
         fail("--set changes a system, but there is none; give it with --system.")
-    if is_url(str(dataset)):
+    if is_url(dataset):
         fail(f"{dataset}: a dataset is written to a folder of this machine; mount it, or copy it.")
     table = _table(systems, system, settings)
 
@@ -139,7 +139,7 @@ def analyse_archive_command(
         run_archive(
             sources,
             table,
-            Options(dataset, pattern, track, workers, scheduler, as_json),
+            Options(Path(dataset), pattern, track, workers, scheduler, as_json),
         )
     )
 
