@@ -139,7 +139,7 @@ def _draw_drifts(axes: Axes, instruments: Sequence[Document]) -> None:
         _points(axes, name, known, [f.get("sigma") for f in found])
     axes.axhline(0.0, color="black", linewidth=1)
     _spread_out(axes)
-    axes.set_ylabel("drift, um/day")
+    axes.set_ylabel("drift, µm/day")
     axes.set_title("Drift with one standard deviation", fontsize=10)
 
 
@@ -188,6 +188,7 @@ def _draw_days(axes: Axes, days: Mapping[str, Sequence[int]]) -> None:
 
 
 def _name_instruments(axes: Axes, names: Sequence[str]) -> None:
+    axes.set_xlim(-0.6, len(names) - 0.4)
     axes.grid(axis="y", color="#e4e4e4")
     axes.set_axisbelow(True)
     if len(names) > _MOST_NAMES:
@@ -210,13 +211,13 @@ _COLUMNS: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
             (f"resolution {c}, nm", f"resolution_{c}_nm", ("resolution_nm", c, "sigma"), "error"),
             (f"stated {c}, nm", f"stated_{c}_nm", ("resolution_nm", c, "stated"), ""),
             (f"ratio {c}", f"ratio_{c}", ("resolution_nm", c, "ratio"), "ratio_error"),
-            (f"drift {c}, um/day", f"drift_{c}_um_per_day", ("drift_um_per_day", c, "slope"),
+            (f"drift {c}, µm/day", f"drift_{c}_um_per_day", ("drift_um_per_day", c, "slope"),
              "sigma"),
         )
     ],
     ("interval, s", "interval_s", ("interval_s",), ""),
     ("chi2/ndf", "chi2_ndf", ("chi2_ndf", "1"), ""),
-    ("blur, um", "blur_um", ("blur_um", "1"), ""),
+    ("blur, µm", "blur_um", ("blur_um", "1"), ""),
     ("light, grey", "light_level", ("light_level", "1"), ""),
 )  # fmt: skip
 
