@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rasnik import Track
+from rasnik import Track, load_system
 from rasnik.characterisation.gaps import Series
-from rasnik.io import write_track
+from rasnik.io import TrackWriter, write_track
 from rasnik.io.seed_codes import Direction, Site, band_code, channel_code
 from rasnik.io.seismic_files import (
     SeismicChannel,
@@ -250,6 +250,35 @@ def test_overlaps_and_moved_clocks_are_refused(tmp_path):
             read_miniseed(tmp_path / "b.mseed", metres_per_count=1)
 
 
+@pytest.mark.parametrize("with_inventory", [True, False])
+def test_a_rate_of_many_digits_survives(tmp_path, with_inventory):
+    """miniSEED holds 7 digits: after millions of samples gaps would be misplaced."""
+    rate_hz = 274.99834567
+    values = np.arange(2_000_000.0)
+    values[1_000_000:1_000_005] = values[1_999_000:1_999_500] = np.nan
+    one = SeismicChannel(SITE, Series(values, rate_hz, "x_um", "nm", START_S), MASS)
+    write_miniseed([one], tmp_path / "a.mseed")
+    write_station_xml([one], tmp_path / "a.xml")
+    inventory = read_inventory(tmp_path / "a.xml") if with_inventory else None
+    size_m = None if with_inventory else 1.0
+    (back,) = read_miniseed(tmp_path / "a.mseed", inventory, metres_per_count=size_m)
+    assert back.rate_hz == pytest.approx(rate_hz, rel=1e-14 if with_inventory else 1e-7)
+    np.testing.assert_allclose(back.values, values, rtol=1e-14)
+
+
+def test_response_of_another_recording_is_refused(tmp_path):
+    write_miniseed([channel(np.arange(9.0), code="BHZ")], tmp_path / "a.mseed")
+    slower = Series(np.arange(9.0), 19.9, "x_um", "nm", START_S)
+    inventory = to_inventory([replace(channel(np.arange(9.0)), series=slower, code="BHZ")])
+    with pytest.raises(ValueError, match="20 samples/s where 19.9 are expected"):
+        read_miniseed(tmp_path / "a.mseed", inventory)
+
+
+def test_integers_without_any_value():
+    with pytest.raises(ValueError, match="no frame with a position"):
+        to_stream([channel([np.nan] * 4, encoding="STEIM2")])
+
+
 def test_without_obspy_it_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "obspy", None)
     with pytest.raises(ImportError, match=r'pip install "rasnik\[seismic\]"'):
@@ -385,6 +414,19 @@ def test_export_writes_both_files(tmp_path):
     assert rasnik(*command, "--overwrite", *camera).exit_code == 0
     (trace, *_) = obspy_read(tmp_path / "a.mseed").select(id="XX.RAS1..SH1")
     np.testing.assert_allclose(trace.data[:7], -1e4 * track_of().x_um[:7], atol=0.5)
+
+
+def test_exposure_of_the_stored_system_is_in_the_response(tmp_path):
+    system = load_system("solidras", {"sensor.frame_rate_hz": 20.0, "sensor.exposure_s": 0.04})
+    with TrackWriter(tmp_path / "track.h5", system=system) as writer:
+        writer.write(track_of())
+    options = ("--station", "RAS1", "--stationxml", tmp_path / "a.xml", "--place", "1,2")
+    assert (
+        rasnik("export", tmp_path / "track.h5", "-o", tmp_path / "a.mseed", *options).exit_code == 0
+    )
+    response = read_inventory(tmp_path / "a.xml")[0][0][0].response
+    found = response.get_evalresp_response_for_frequencies(np.array([5.0]), "DISP")
+    np.testing.assert_allclose(np.abs(found), np.sinc(5 * 0.04), rtol=2e-4)
 
 
 @pytest.mark.parametrize(

@@ -50,6 +50,8 @@ ENCODINGS = {"FLOAT64": np.float64, "STEIM2": np.int32}
 
 _NM_PER_M = 1e9
 _DEFAULT_COUNT_NM = 0.01
+# miniSEED holds rates in 32 bits, rounded by this fraction at most.
+_RATE_ROUNDING = 1e-7
 _LARGEST_COUNT = 2**31 - 1
 # Steim2 stores differences of at most 30 bits.
 _LARGEST_STEP = 2**29 - 1
@@ -164,11 +166,10 @@ class SeismicChannel:
         if self.encoding != "STEIM2":
             return values
         values = np.rint(values)
-        excess = max(
-            np.nanmax(np.abs(values), initial=0) / _LARGEST_COUNT,
-            max((np.abs(np.diff(run)).max(initial=0) for run in self.series.runs()), default=0)
-            * (self.counts_per_m / _NM_PER_M / _LARGEST_STEP),
-        )
+        counts = [self.counts_per_m / _NM_PER_M * run for run in self.series.runs()]
+        largest = max((np.abs(run).max() for run in counts), default=0.0)
+        step = max((np.abs(np.diff(run)).max(initial=0) for run in counts), default=0.0)
+        excess = max(largest / _LARGEST_COUNT, step / _LARGEST_STEP)
         if excess > 1:
             least = float(f"{(self.count_nm or _DEFAULT_COUNT_NM) * excess * 1.1:.1g}")
             raise ValueError(
@@ -263,9 +264,7 @@ def write_miniseed(
     """
     path, channels = Path(path), list(channels)
     if path.exists() and not overwrite:
-        raise FileExistsError(
-            f"{path} exists already; give another name, or overwrite=True to replace it"
-        )
+        raise FileExistsError(f"{path} exists already; give another name, or overwrite=True")
     stream = to_stream(channels)
     encodings = {one.identifier: one.encoding for one in channels}
     unfinished = path.with_name(f"{path.stem}.partial{path.suffix}")
@@ -315,8 +314,8 @@ def read_miniseed(
         raise FileNotFoundError(f"{path}: there is no such file")
     if (inventory is None) == (metres_per_count is None):
         raise ValueError(
-            f"{path}: miniSEED does not say what its numbers mean; give either the StationXML that "
-            "belongs to it or the metres of a count"
+            f"{path}: miniSEED does not say what its numbers mean; give its StationXML or the "
+            "metres of a count, and not both"
         )
     try:
         stream = obspy().read(path, format="MSEED")
@@ -328,12 +327,14 @@ def read_miniseed(
     found = []
     for name in names:
         traces = sorted((t for t in stream if t.id == name), key=lambda t: t.stats.starttime)
-        size_m = metres_per_count
+        size_m, rate_hz = metres_per_count, float(traces[0].stats.sampling_rate)
         if size_m is None:
-            from rasnik.io.station_xml import counts_per_metre
+            from rasnik.io.station_xml import counts_per_metre, sample_rate_hz
 
-            size_m = 1 / counts_per_metre(inventory, name, traces[0].stats.starttime)
-        found.append(_joined(name, traces, size_m * _NM_PER_M))
+            when = traces[0].stats.starttime
+            size_m = 1 / counts_per_metre(inventory, name, when)
+            rate_hz = sample_rate_hz(inventory, name, when) or rate_hz
+        found.append(_joined(name, traces, size_m * _NM_PER_M, rate_hz))
     return found
 
 
@@ -352,33 +353,37 @@ def _traces(channel: SeismicChannel) -> list[Trace]:
     edges = np.flatnonzero(np.diff(np.isfinite(samples), prepend=False, append=False))
     if not len(edges):
         raise ValueError(f"{series.name} has no frame with a position")
-    network, station, location, code = channel.identifier.split(".")
+    keys = ("network", "station", "location", "channel")
+    names = dict(zip(keys, channel.identifier.split("."), strict=True))
     traces = []
     for first, last in edges.reshape(-1, 2):
         # Whole nanoseconds, since a float of seconds since 1970 is good to a quarter of a us.
         whole_s, rest_s = divmod(series.start_s, 1)
         begin_ns = int(whole_s) * 10**9 + round((rest_s + first / series.rate_hz) * 1e9)
-        header = {
-            "network": network,
-            "station": station,
-            "location": location,
-            "channel": code,
-            "sampling_rate": series.rate_hz,
-            "starttime": package.UTCDateTime(ns=begin_ns),
-        }
+        start = package.UTCDateTime(ns=begin_ns)
+        header = {**names, "sampling_rate": series.rate_hz, "starttime": start}
         data = np.ascontiguousarray(samples[first:last], dtype=ENCODINGS[channel.encoding])
         traces.append(package.Trace(data, header))
     return traces
 
 
-def _joined(name: str, traces: list[Trace], size_nm: float) -> Series:
+def _joined(name: str, traces: list[Trace], size_nm: float, rate_hz: float) -> Series:
     first = traces[0].stats
-    rates_hz = {trace.stats.sampling_rate for trace in traces}
-    if len(rates_hz) > 1:
-        raise ValueError(f"{name} changes its rate: {', '.join(f'{r:g}' for r in rates_hz)} Hz")
-    shifts = [(t.stats.starttime - first.starttime) * first.sampling_rate for t in traces]
-    places = [round(shift) for shift in shifts]
-    off = max(abs(shift - place) for shift, place in zip(shifts, places, strict=True))
+    for trace in traces:
+        if abs(trace.stats.sampling_rate / rate_hz - 1) > _RATE_ROUNDING:
+            raise ValueError(
+                f"{name} has {trace.stats.sampling_rate:.9g} samples/s where {rate_hz:.9g} are "
+                "expected; its rate changes, or the StationXML belongs to another recording"
+            )
+    passed_s = [trace.stats.starttime - first.starttime for trace in traces]
+    places, stored_hz = [0], rate_hz
+    for later_s in passed_s[1:]:
+        places.append(round(later_s * rate_hz))
+        # After millions of samples the beginning of a trace tells the rate better.
+        if later_s > 0 and abs(later_s * rate_hz - places[-1]) > TOLERANCE / 5:
+            better_hz = places[-1] / later_s
+            rate_hz = better_hz if abs(better_hz / stored_hz - 1) < _RATE_ROUNDING else rate_hz
+    off = max(abs(s * rate_hz - place) for s, place in zip(passed_s, places, strict=True))
     ends = [place + trace.stats.npts for place, trace in zip(places, traces, strict=True)]
     if any(begin < end for begin, end in zip(places[1:], ends[:-1], strict=True)):
         raise ValueError(f"{name} has traces that overlap")
@@ -391,4 +396,4 @@ def _joined(name: str, traces: list[Trace], size_nm: float) -> Series:
     for place, end, trace in zip(places, ends, traces, strict=True):
         values[place:end] = trace.data * size_nm
     start_s = first.starttime.ns / 1e9
-    return Series(values, float(first.sampling_rate), name, "nm", float(start_s))
+    return Series(values, rate_hz, name, "nm", float(start_s))

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 __all__ = [
     "counts_per_metre",
     "exposure_filter",
+    "sample_rate_hz",
     "to_inventory",
     "write_station_xml",
 ]
@@ -132,11 +133,8 @@ def counts_per_metre(inventory: Inventory, identifier: str, when: Any) -> float:
     ValueError
         If the channel is not described, or hands on something else than a displacement.
     """
-    try:
-        response = inventory.get_response(identifier, when)
-    except Exception:  # obspy raises a bare Exception
-        raise ValueError(f"the StationXML does not describe {identifier} at this time") from None
-    stages = response.response_stages
+    response = _described(inventory, identifier, when).response
+    stages = response.response_stages if response else []
     if not stages:
         raise ValueError(f"the StationXML holds no stages of the response of {identifier}")
     digital = stages[1:] if (stages[0].output_units or "").upper() == "M" else stages
@@ -146,6 +144,18 @@ def counts_per_metre(inventory: Inventory, identifier: str, when: Any) -> float:
             "displacement sensor"
         )
     return float(np.prod([stage.stage_gain for stage in digital]))
+
+
+def sample_rate_hz(inventory: Inventory, identifier: str, when: Any) -> float | None:
+    """Samples in a second of a channel, which miniSEED rounds to 7 digits; None if not stated.
+
+    Raises
+    ------
+    ValueError
+        If the channel is not described.
+    """
+    rate_hz = _described(inventory, identifier, when).sample_rate
+    return float(rate_hz) if rate_hz else None
 
 
 def exposure_filter(exposure_frames: float) -> NDArray[np.float64]:
@@ -173,6 +183,17 @@ def exposure_filter(exposure_frames: float) -> NDArray[np.float64]:
 
 
 # ------------------------------------------------------------------------ parts
+
+
+def _described(inventory: Inventory, identifier: str, when: Any) -> Any:
+    """The channel of obspy's inventory."""
+    network, station, location, code = identifier.split(".")
+    found = inventory.select(network, station, location, code, time=when)
+    for one in found:
+        for place in one:
+            for channel in place:
+                return channel
+    raise ValueError(f"the StationXML does not describe {identifier} at this time")
 
 
 def _place(one: SeismicChannel) -> tuple[float, float]:
