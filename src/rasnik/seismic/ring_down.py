@@ -4,7 +4,7 @@
 
 is fitted to the readings themselves by least squares, whatever is missing among them. With white
 noise no unbiased estimate is better (Cramer and Rao). Noise that is stronger around the resonance,
-such as the ground's motion, enlarges the errors by what it is seen to be stronger there.
+such as the ground's motion, enlarges the errors (`rasnik.seismic.ring_down_noise`).
 
 One decay at one frequency does not tell viscous from structural damping.
 """
@@ -19,9 +19,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rasnik.characterisation.gaps import Series
+from rasnik.seismic.ring_down_noise import Rest, covariance
 from rasnik.seismic.suspension import Suspension
 
 __all__ = ["RingDown", "ring_down"]
+
+_Values = NDArray[np.float64]
 
 _LEAST_VALUES = 24
 _LEAST_PERIODS = 2.0
@@ -53,14 +56,14 @@ class RingDown:
     offset, drift : float
         In the unit of the series, and per second.
     covariance : ndarray, shape (6, 6)
-        In the order above. That of offset and drift holds for noise as around the resonance.
+        In the order above.
     rms : float
         Standard deviation of what remains.
     chi2_ndf : float
         NaN if the noise of the readings was not given.
     colour : float
-        Power of what remains around the resonance, over that of white noise; where it
-        exceeds what chance allows the covariance is enlarged by it.
+        Power of what remains around the resonance, over that of white noise; 1 where chance
+        explains it, else the covariance counts it.
     not_exponential : float
         Chance of so much departure from an exponential decay at one frequency.
     decays : bool
@@ -134,13 +137,13 @@ class RingDown:
     def as_dict(self) -> dict[str, Any]:
         """For JSON; None for what is not known."""
         end = f"_{self.series.unit}"
-        names = ("frequency_hz", "loss", f"amplitude{end}", "phase_rad", f"offset{end}",
-                 f"drift{end}_per_s")  # fmt: skip
-        found = (self.frequency_hz, self.loss, self.amplitude, self.phase_rad, self.offset,
-                 self.drift)  # fmt: skip
-        document: dict[str, Any] = dict(zip(names, found, strict=True))
-        for name, sigma in zip(names, self.sigmas, strict=True):
-            document[f"sigma_{name}"] = float(sigma)
+        fitted = {
+            "frequency_hz": self.frequency_hz, "loss": self.loss,
+            f"amplitude{end}": self.amplitude, "phase_rad": self.phase_rad,
+            f"offset{end}": self.offset, f"drift{end}_per_s": self.drift,
+        }  # fmt: skip
+        sigmas = zip(fitted, self.sigmas.tolist(), strict=True)
+        document: dict[str, Any] = fitted | {f"sigma_{name}": sigma for name, sigma in sigmas}
         others = {
             "q": self.q,
             "sigma_q": self.sigma_q,
@@ -183,64 +186,66 @@ def ring_down(
     places = np.flatnonzero(np.isfinite(series.values))
     span_s = (places[-1] - places[0]) / series.rate_hz
     t, y = places / series.rate_hz, series.values[places]
-    level, size = float(y.mean()), float(y.std())
-    if size == 0:
+    if not y.std() > 0:
         raise ValueError("all readings are the same; nothing swings")
-    y = (y - level) / size
     fit = _Decay(t, y, span_s)
-    start = _start(series, fit, frequency_hz)
-    found, rest = fit.solve(start)
+    found, rest = fit.solve(_start(series, fit, frequency_hz))
     if found[0] * span_s < 2 * math.pi * _LEAST_PERIODS:
         raise ValueError(
             f"{span_s:.4g} s hold fewer than {_LEAST_PERIODS:g} periods of the oscillation; take "
             "a longer track"
         )
-    return _result(series, fit, found, rest, None if sigma is None else sigma / size, level, size)
+    return _result(series, fit, found, rest, sigma)
 
 
 # ------------------------------------------------------------------------ fit
 
 
 class _Decay:
-    """Readings y at times t, and the model in (w, g, a, b, offset, drift)."""
+    """Readings at times t, scaled to mean 0 and size 1, and the model.
 
-    def __init__(self, t: NDArray[np.float64], y: NDArray[np.float64], span_s: float) -> None:
+    The model is in (w, g, a, b, offset, drift).
+    """
+
+    def __init__(self, t: _Values, y: _Values, span_s: float) -> None:
+        self.level, self.size = float(y.mean()), float(y.std())
+        y = (y - self.level) / self.size
         self.t, self.y, self.span_s = t, y, span_s
         self.steady = np.stack([np.ones(len(t)), t / span_s], axis=1)
         self.flat = y - self.steady @ np.linalg.lstsq(self.steady, y, rcond=None)[0]
 
-    def swings(self, w: float, g: float) -> NDArray[np.float64]:
+    def swings(self, w: float, g: float) -> _Values:
         """exp(-g t) cos(w t) and exp(-g t) sin(w t), shape (n, 2)."""
         # A wild step of the solver must not overflow.
         decay = np.exp(np.clip(-g * self.t, -700, 60))
         return np.stack([decay * np.cos(w * self.t), decay * np.sin(w * self.t)], axis=1)
 
-    def linear(self, w: float, g: float) -> tuple[NDArray[np.float64], float]:
+    def linear(self, w: float, g: float) -> tuple[_Values, float]:
         """Best (a, b, offset, drift) with this w and g, and the sum of squares that remains."""
         columns = np.concatenate([self.swings(w, g), self.steady], axis=1)
         norm = np.linalg.norm(columns, axis=0)
-        columns /= norm  # of tens of thousands of rows: the normal equations are far quicker
+        columns /= norm  # rows are many: the normal equations are far quicker
         found = np.linalg.lstsq(columns.T @ columns, columns.T @ self.y, rcond=None)[0]
         return found / norm, float(np.sum((self.y - columns @ found) ** 2))
 
-    def rest(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rest(self, p: _Values) -> _Values:
         columns = np.concatenate([self.swings(p[0], p[1]), self.steady], axis=1)
         return np.asarray(columns @ p[2:] - self.y)
 
-    def jacobian(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
+    def jacobian(self, p: _Values) -> _Values:
         swings = self.swings(p[0], p[1])
         turned = swings @ np.array([p[3], -p[2]])  # d/d(w t)
         whole = swings @ p[2:4]
         slopes = np.stack([self.t * turned, -self.t * whole], axis=1)
         return np.concatenate([slopes, swings, self.steady], axis=1)
 
-    def bends(self, p: NDArray[np.float64]) -> NDArray[np.float64]:
+    def bends(self, p: _Values) -> _Values:
         """What a decay and a frequency that change along the way would add, shape (n, 2)."""
         swings, t2 = self.swings(p[0], p[1]), (self.t / self.span_s) ** 2
         both = [swings @ p[2:4], swings @ np.array([p[3], -p[2]])]
         return np.stack([t2 * one for one in both], axis=1)
 
-    def solve(self, start: tuple[float, float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def solve(self, start: tuple[float, float]) -> tuple[_Values, _Values]:
         """(parameters, what remains)."""
         from scipy.optimize import least_squares
 
@@ -284,45 +289,39 @@ def _peak_hz(series: Series, fit: _Decay, about_hz: float | None) -> float:
 
 
 def _result(
-    series: Series,
-    fit: _Decay,
-    p: NDArray[np.float64],
-    rest: NDArray[np.float64],
-    sigma: float | None,
-    level: float,
-    size: float,
+    series: Series, fit: _Decay, p: _Values, rest: _Values, sigma: float | None
 ) -> RingDown:
     """The decay in the units of the series, with its errors and what to know of it."""
     freedom = len(rest) - 6
     variance = float(rest @ rest) / freedom
-    if not float(fit.flat @ fit.flat - rest @ rest) > _LEAST_DROP * variance:
-        raise ValueError("no free oscillation stands out of the noise of the readings")
+
+    def left(values: _Values) -> Rest:
+        frequency = math.hypot(p[0], p[1]) / (2 * math.pi * series.rate_hz)
+        loss = 2 * p[1] / math.hypot(p[0], p[1])
+        return Rest(
+            np.flatnonzero(np.isfinite(series.values)), values, len(series), frequency, loss
+        )
+
     jacobian = fit.jacobian(p)
+    stated = 0.0 if sigma is None else (sigma / fit.size) ** 2
+    spread, level, colour = covariance(left(rest), jacobian, max(variance, stated))
+    if not float(fit.flat @ fit.flat - rest @ rest) > _LEAST_DROP * variance * level:
+        raise ValueError("no free oscillation stands out of what else is in the readings")
     bent, stat = _bending(fit, p, jacobian, rest, variance)
-    colour = _colour(series, fit, p, rest)
-    chance = math.exp(-0.5 * stat / max(1.0, _colour(series, fit, p, bent)))  # of chi-square, 2
-    chi2_ndf = math.nan if sigma is None else variance / sigma**2
-    scaled = max(variance, 0.0 if sigma is None else sigma**2) * max(colour, 1.0)
-    norm = np.linalg.norm(jacobian, axis=0)
-    covariance = scaled * np.linalg.inv((jacobian / norm).T @ (jacobian / norm))
-    covariance /= np.outer(norm, norm)
-    values, turn = _physical(p, level, size, fit.span_s)
-    covariance = turn @ covariance @ turn.T
-    decays = values[1] > _LEAST_DECAY * math.sqrt(covariance[1, 1])
+    chance = math.exp(-0.5 * stat / left(bent).spectrum()[1])  # of chi-square with 2 degrees
+    values, turn = _physical(p, fit)
+    spread = turn @ spread @ turn.T
+    decays = values[1] > _LEAST_DECAY * math.sqrt(spread[1, 1])
     found = RingDown(
-        *values, covariance, math.sqrt(variance) * size, chi2_ndf, colour, chance, decays,
-        (), series,
+        *values, spread, math.sqrt(variance) * fit.size,
+        variance / stated if stated else math.nan, colour, chance, decays, (), series,
     )  # fmt: skip
     return replace(found, remarks=_remarks(found, freedom))
 
 
 def _bending(
-    fit: _Decay,
-    p: NDArray[np.float64],
-    jacobian: NDArray[np.float64],
-    rest: NDArray[np.float64],
-    variance: float,
-) -> tuple[NDArray[np.float64], float]:
+    fit: _Decay, p: _Values, jacobian: _Values, rest: _Values, variance: float
+) -> tuple[_Values, float]:
     """What remains with a changing decay and frequency, and how much that takes off chi-square.
 
     To first order: the score test, with two degrees of freedom.
@@ -335,46 +334,26 @@ def _bending(
     return bent, float(rest @ rest - bent @ bent) / variance
 
 
-def _colour(
-    series: Series, fit: _Decay, p: NDArray[np.float64], rest: NDArray[np.float64]
-) -> float:
-    """Power of what remains around the resonance, over its mean; 1 where chance explains it."""
-    from scipy import fft
-
-    shown = np.zeros(len(series))
-    shown[np.isfinite(series.values)] = rest
-    power = np.abs(fft.rfft(shown)) ** 2
-    bin_hz = series.rate_hz / len(series)
-    reach = max(10, math.ceil(abs(p[1]) / math.pi / bin_hz))
-    middle = round(p[0] / (2 * math.pi) / bin_hz)
-    near = power[max(1, middle - reach) : middle + reach + 1]
-    if len(near) < 8:
-        return 1.0
-    # The fit has taken four parameters, two bins' worth, out of them.
-    ratio = float(near.sum() / (len(near) - 2) / power[1:].mean())
-    return ratio if ratio > 1 + 4 / math.sqrt(len(near)) else 1.0
-
-
 def _physical(
-    p: NDArray[np.float64], level: float, size: float, span_s: float
-) -> tuple[tuple[float, float, float, float, float, float], NDArray[np.float64]]:
+    p: _Values, fit: _Decay
+) -> tuple[tuple[float, float, float, float, float, float], _Values]:
     """(f0, 1/Q, A, phi, offset, drift) in the units of the series, and their derivatives."""
     w, g, a, b, offset, drift = (float(value) for value in p)
     w0, amplitude = math.hypot(w, g), math.hypot(a, b)
     turn = np.zeros((6, 6))
     turn[0, :2] = np.array([w, g]) / w0 / (2 * math.pi)
     turn[1, :2] = 2 * np.array([-g * w, w * w]) / w0**3
-    turn[2, 2:4] = np.array([a, b]) / amplitude * size
+    turn[2, 2:4] = np.array([a, b]) / amplitude * fit.size
     turn[3, 2:4] = np.array([b, -a]) / amplitude**2
-    turn[4, 4] = size
-    turn[5, 5] = size / span_s
+    turn[4, 4] = fit.size
+    turn[5, 5] = fit.size / fit.span_s
     values = (
         w0 / (2 * math.pi),
         2 * g / w0,
-        amplitude * size,
+        amplitude * fit.size,
         math.atan2(-b, a),
-        level + offset * size,
-        drift * size / span_s,
+        fit.level + offset * fit.size,
+        drift * fit.size / fit.span_s,
     )
     return values, turn
 
