@@ -164,6 +164,14 @@ def test_what_was_changed_is_seen_at_once(station: Any) -> None:
     assert remote.snapshot().read_bytes() == b"a picture"
 
 
+def test_the_newest_rows_are_read_by_who_writes_them(station: Any) -> None:
+    remote = remote_of(station).channels["top"]
+    now = time.time()
+    assert remote.history(now - 5, now, 8)["count"].sum() == 8  # the fake one knows no files
+    assert remote.history(now - 15, now - 10, 8)["count"].sum() == 0  # which are read here
+    assert remote.history(now - 3600, now, 8)["count"].sum() == 0
+
+
 class _OddError(ValueError):
     """Cannot be made again from what it keeps."""
 
@@ -192,7 +200,7 @@ def test_errors_come_back_as_themselves(
     assert str(raised.value) == str(error)
 
 
-@pytest.mark.parametrize("question", ["stop", "__class__", "history", "recorder"])
+@pytest.mark.parametrize("question", ["stop", "__class__", "_track", "recorder"])
 def test_nothing_else_can_be_asked(station: Any, question: str) -> None:
     line = line_to(station)
     with pytest.raises(RuntimeError, match="its log says why"):
@@ -340,6 +348,19 @@ def test_it_ends_with_its_connections(station: Any) -> None:
     assert time.monotonic() - start < 8
     assert not is_there(pid)
     until(lambda: threads() == before, "threads end")
+
+
+def test_a_service_that_ends_both_at_once_says_nothing(
+    station: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """systemd sends its signal to all processes."""
+    with PageProcess(station, Server(port=0)) as page:
+        pid = page.pid
+        assert pid is not None
+        os.kill(pid, signal.SIGTERM)
+        os.kill(pid, signal.SIGINT)  # of a terminal
+        until(lambda: not is_there(pid), "the page ends")
+    assert page.message == caplog.text == ""
 
 
 def test_what_is_missing_is_said(station: Any, tmp_path: Path, monkeypatch: Any) -> None:

@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 #: What the page's process says when it serves; anything else is a sentence why it does not.
 READY = b"ready"
 _LARGE_BYTES = 4096  # sent from where they lie
-_ACTIONS = frozenset(
+_METHODS = frozenset(
     {
         "set_exposure",
         "keep_exposure",
@@ -35,6 +35,7 @@ _ACTIONS = frozenset(
         "start_recording",
         "stop_recording",
         "snapshot",
+        "history",
     }
 )
 
@@ -123,7 +124,7 @@ class Answers:
             return None if known else sample
         if question == "recorded":
             return channel.recorder.current()
-        if question not in _ACTIONS:
+        if question not in _METHODS:
             raise KeyError(question)
         return getattr(channel, question)(*arguments)
 

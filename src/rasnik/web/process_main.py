@@ -6,9 +6,11 @@ with the station's process, however that ends.
 
 from __future__ import annotations
 
+import importlib
 import signal
 import socket
 import sys
+from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any, cast
 
@@ -40,6 +42,7 @@ def _serve(station: Any, token: str | None, listener: socket.socket, control: Co
     from rasnik.web.line import READY
     from rasnik.web.serving import PageError, Serving
 
+    _load()
     try:
         serving = Serving(station, token, listener)
     except PageError as error:
@@ -50,6 +53,15 @@ def _serve(station: Any, token: str | None, listener: socket.socket, control: Co
         control.recv_bytes()
     finally:
         serving.stop()
+
+
+def _load() -> None:
+    """Load what is loaded at its first use, so that no viewer waits for it."""
+    with suppress(ImportError):  # what is missing is told by who needs it
+        importlib.import_module("scipy.signal")
+        from PIL import Image
+
+        Image.preinit()
 
 
 if __name__ == "__main__":
