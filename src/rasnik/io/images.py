@@ -32,6 +32,8 @@ from rasnik.io.lwdaq import lwdaq_bounds, lwdaq_text
 
 __all__ = ["Frame", "Source", "count_frames", "expand_paths", "iter_frames", "split_dataset"]
 
+_SINGLE = (".png", ".bmp", ".jpg", ".jpeg")  # formats of one image a file
+
 Bounds = tuple[int, int, int, int]
 PathLike = str | os.PathLike[str]
 
@@ -282,6 +284,8 @@ def count_frames(source: Source) -> int:
     """
     if source.error is not None:
         return 1
+    if source.url is not None and source.url.partition("::")[0].lower().endswith(_SINGLE):
+        return 1  # not worth a copy
     try:
         with open_stack(source.url or source.path, source.dataset) as stack:
             return stack.count + (stack.error is not None)

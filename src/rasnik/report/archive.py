@@ -180,6 +180,7 @@ def _draw_days(axes: Axes, days: Mapping[str, Sequence[int]]) -> None:
     place = np.arange(len(names))
     axes.bar(place, images - failed, color=_COLOURS["x"], label="with a position")
     axes.bar(place, failed, bottom=images - failed, color=_FAILED, label="without")
+    axes.set_ylim(0, 1.25 * max(1.0, float(images.max(initial=0.0))))  # room for the legend
     shown = place if len(names) <= 12 else np.linspace(0, len(names) - 1, 10).astype(int)
     axes.set_xticks(shown, [names[k] for k in shown], rotation=40, ha="right", fontsize=8)
     axes.set_ylabel("images a day")
