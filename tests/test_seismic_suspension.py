@@ -228,6 +228,7 @@ def test_suspension_from_a_linkage(tmp_path: Path) -> None:
         ("[suspension]\nfrequency_hz = -1\nq = 100\n", "frequency_hz = -1"),
         ("frequency_hz = 0.5\n", "there is no field frequency_hz"),
         ("", "neither a table"),
+        ("suspension = 3\n", "suspension = 3: it should be a table of fields"),
         ("[suspension]\nfrequency_hz = 0.5\n" + LINKAGE_TOML, "follows from .linkage."),
         (LINKAGE_TOML.replace("0.4", "0.9"), "falls over"),
         (LINKAGE_TOML.replace("100.0", "-100.0"), "length_mm"),

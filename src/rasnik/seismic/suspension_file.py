@@ -36,10 +36,16 @@ __all__ = ["load_suspension"]
 _FROM_LINKAGE = ("frequency_hz", "mass_kg", "kind", "coupling")
 
 
+class _Table(BaseModel):
+    """Fields that are checked once those of the linkage and of options have joined them."""
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+
 class _File(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    suspension: dict[str, Any] = {}
+    suspension: _Table = _Table()
     linkage: WattLinkage | None = None
 
 
