@@ -9,6 +9,7 @@ pytest.importorskip("obspy", reason="needs obspy")
 study = pytest.importorskip("ground_motion", reason="the benchmarks are not beside the tests")
 
 
+@pytest.mark.slow
 def test_ground_motion_survives_images_tracking_and_files(tmp_path, capsys):
     setting = study.Setting(n=420, low_hz=3.0, pixels=(192, 144))
     rows, track, _ = study.run(setting, tmp_path)

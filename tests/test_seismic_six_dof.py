@@ -213,7 +213,7 @@ def test_motion_of_tracks_about_their_mean():
 def test_ground_in_six():
     """A frame that moves and turns sinusoidally: r / x_g in closed form, each with its own f0."""
     six = SixDof(sensor(TRIAD))
-    t_s, f_hz = np.arange(6000) / RATE_HZ, 1.0
+    t_s, f_hz = np.arange(1200) / RATE_HZ, 1.0
     masses = {
         "x_um": Suspension(frequency_hz=0.5, q=3.0),
         "ry_rad": Suspension(frequency_hz=2.0, q=10.0),
@@ -225,9 +225,9 @@ def test_ground_in_six():
         motions[:, DOFS.index(name)] = amplitude * np.real(response * np.exp(s * t_s))
         grounds[name] = amplitude * np.real(np.exp(s * t_s))
     found = ground_in_six(
-        six.motion(tracks_of(six, six.readings(motions))), masses, "displacement", band_hz=(0.2, 5)
+        six.motion(tracks_of(six, six.readings(motions))), masses, "displacement", band_hz=(0.5, 5)
     )
-    inside = slice(1000, -1000)
+    inside = slice(300, -300)
     np.testing.assert_allclose(
         found["x_um"].values[inside], 1e3 * grounds["x_um"][inside], atol=1e3 * 0.05 * 2e-3
     )
