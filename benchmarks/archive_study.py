@@ -41,7 +41,7 @@ KINDS = ("png", "tif", "tiff stack", "hdf5", "zarr")
 BEGIN_S = 1.77e9
 EVERY_S = 150.0  # between images of a folder: 2000 of them make four days
 STACK = 500  # frames of a TIFF stack
-JUMPING, BLANK_EVERY, DAMAGED_EVERY = 17, 401, 307
+JUMPING, BLANK_EVERY, DAMAGED_EVERY = 17, 131, 97
 LONGEST_S = 900.0
 
 
@@ -471,7 +471,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     if options.timed is None:
-        options.timed = max(options.workers * 5, options.instruments // 5)
+        options.timed = max(options.workers * 5, 2 * options.instruments // 5)
     options.timed = min(options.timed, options.instruments)
     print(f"{_study.environment()}, seed {options.seed}")
     folder = Path(tempfile.mkdtemp(dir=options.folder, prefix="archive-study-"))
