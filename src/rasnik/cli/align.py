@@ -156,7 +156,7 @@ def _print(found: Adjustment, *, has_readings: bool, every: bool) -> None:
     installation = found.network.installation
     console.print(
         f"{installation.name}: {len(installation.bodies)} bodies, "
-        f"{len(installation.rasniks)} Rasniks",
+        f"{len(installation.rasniks)} Rasnik{'s' if len(installation.rasniks) > 1 else ''}",
         markup=False,
     )
     if not has_readings:
@@ -289,9 +289,10 @@ def _check_cells(one: Check) -> list[str]:
 
 
 def _print_reliability(found: Adjustment) -> None:
-    """The weakest checked value of each kind."""
+    """The weakest checked reading of each kind."""
+    readings = [one for one in found.checks if one.rasnik in found.network.rasniks]
     for value in ("x", "y", "scale", "theta"):
-        checked = [one for one in found.checks if one.value == value and one.redundancy > 0]
+        checked = [one for one in readings if one.value == value and one.redundancy > 0]
         if checked:
             worst = max(checked, key=lambda one: one.detectable)
             unit, factor = _SHOWN.get(value, _ANGLE)
