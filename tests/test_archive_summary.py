@@ -79,7 +79,7 @@ def test_drift_of_a_line_without_scatter_is_its_slope() -> None:
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
 def test_drift_has_the_error_that_it_states(rng: np.random.Generator, correlation: float) -> None:
     """Autoregressive scatter, where the error of a plain line would be wrong up to 4 times."""
-    n, runs, true = 1500, 200, -0.7
+    n, runs, true = 1500, 100, -0.7
     t = START_S + np.arange(n) * 600.0
     pulls = []
     for _ in range(runs):
@@ -143,7 +143,7 @@ def test_known_scatter_and_drift_come_back(tmp_path: Path, rng: np.random.Genera
 
 def test_stated_error_of_the_scatter(tmp_path: Path, rng: np.random.Generator) -> None:
     pulls = []
-    for number in range(60):
+    for number in range(40):
         write_rows(tmp_path / str(number), "A", 2e-3 * rng.normal(size=400))
         one = summarise(tmp_path / str(number)).instruments[0].scatter["x"]
         pulls.append((one.sigma - 2.0) / one.sigma_error)

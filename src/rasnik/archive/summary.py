@@ -364,8 +364,8 @@ def _scatter(one: Scatter | None) -> dict[str, Any] | None:
         return None
     ratio = one.sigma / one.stated if one.stated > 0 else math.nan
     return {
-        "sigma": one.sigma,
-        "error": one.sigma_error,
+        "sigma": _known(one.sigma),
+        "error": _known(one.sigma_error),
         "stated": _known(one.stated),
         "ratio": _known(ratio),
         "ratio_error": _known(one.sigma_error / one.stated) if one.stated > 0 else None,

@@ -195,5 +195,8 @@ def _drawn(worst: Worst) -> tuple[bytes | None, str]:
         residuals = residual_image(frame.image, pose, system, frame.bounds_px)
     sink = io.BytesIO()
     overlay_figure(frame.image, pose, system, residuals).savefig(sink, format="png", dpi=80)
-    remark = "Analysed by itself it has a position." if pose.ok and worst.is_failure else ""
+    remark = ""
+    if pose.ok == worst.is_failure:
+        has = "a position" if pose.ok else "no position"
+        remark = f"Analysed again by itself, with its system and nothing else, it has {has}."
     return sink.getvalue(), remark
