@@ -22,6 +22,7 @@ __all__ = ["Item", "LeftOut", "find_items", "frames_of"]
 
 _SUFFIXES = (*IMAGE_SUFFIXES, *STACK_SUFFIXES, *VIDEO_SUFFIXES)
 _NAMED = 20
+_TWICE = "found elsewhere"
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,8 @@ class LeftOut:
     Attributes
     ----------
     counts : dict of str to int
-        Reasons: ``hidden``, ``not an image``, ``outside the pattern``.
+        Reasons: ``hidden``, ``not an image``, ``outside the pattern``, ``found elsewhere`` (by
+        another source, or what a link leads to).
     names : dict of str to list of str
     faults : list of str
         Sentences on sources, folders and files that cannot be read.
@@ -114,16 +116,32 @@ def find_items(
     """
     layout = None if pattern is None else Layout.parse(pattern)
     search = _Search(layout, LeftOut() if left_out is None else left_out)
-    return (item for source in sources for item in search.items(os.fspath(source)))
+    return search.all_items([os.fspath(source) for source in sources])
 
 
 @dataclass(frozen=True)
 class _Search:
     layout: Layout | None
     left_out: LeftOut
+    searched: set[str] = field(default_factory=set)
+    """Real paths of sources, and of what links lead to; nothing must be found twice."""
 
-    def items(self, source: str) -> Iterator[Item]:
-        """Items of one source."""
+    def all_items(self, sources: list[str]) -> Iterator[Item]:
+        """Items of all sources."""
+        for source in sources:
+            place = source if is_url(source) else os.path.realpath(source)
+            if self._is_searched(place):
+                self.left_out.add(_TWICE, source)
+            else:
+                self.searched.add(place)
+                yield from self._items(source)
+
+    def _is_searched(self, place: str) -> bool:
+        """Whether a file or folder lies in what is searched anyway."""
+        above = [place] if is_url(place) else [place, *map(str, Path(place).parents)]
+        return any(one in self.searched for one in above)
+
+    def _items(self, source: str) -> Iterator[Item]:
         url, dataset = split_dataset(source)
         try:
             root = entry_of(unpacked(url))
@@ -134,12 +152,10 @@ class _Search:
         if is_file:
             yield from self._named(root, dataset)
         else:
-            yield from self._folder(root, (), (os.path.realpath(root.url),), root.name)
+            yield from self._folder(root, (), root.name)
 
-    def _folder(
-        self, folder: Entry, parts: tuple[str, ...], above: tuple[str, ...], source: str
-    ) -> Iterator[Item]:
-        """Items of a folder and those below; `above` are the real folders it lies in."""
+    def _folder(self, folder: Entry, parts: tuple[str, ...], source: str) -> Iterator[Item]:
+        """Items of a folder and those below."""
         try:
             entries = list_folder(folder.url)
         except OSError as error:
@@ -148,18 +164,26 @@ class _Search:
         if parts and _is_zarr(entries):
             yield from self._item(folder, parts, source)
             return
+        real = folder.url if is_url(folder.url) else os.path.realpath(folder.url)
         for entry in entries:
             if entry.name.startswith("."):
                 self.left_out.add("hidden", entry.url)
-            elif not entry.is_folder:
-                yield from self._item(entry, (*parts, entry.name), source)
-            elif not is_url(entry.url) and os.path.realpath(entry.url) in above:
-                self.left_out.faults.append(
-                    f"{entry.url}: the link leads back to a folder above it; it is not followed."
-                )
+            elif self._is_known(entry, real):
+                self.left_out.add(_TWICE, entry.url)
+            elif entry.is_folder:
+                yield from self._folder(entry, (*parts, entry.name), source)
             else:
-                inside = (*above, os.path.realpath(entry.url)) if entry.is_link else above
-                yield from self._folder(entry, (*parts, entry.name), inside, source)
+                yield from self._item(entry, (*parts, entry.name), source)
+
+    def _is_known(self, entry: Entry, folder: str) -> bool:
+        """Whether what lies in a (real) folder is found elsewhere; a new link is noted."""
+        if not entry.is_link:
+            return f"{folder}/{entry.name}" in self.searched
+        place = os.path.realpath(entry.url)
+        known = self._is_searched(place)
+        if not known:
+            self.searched.add(place)
+        return known
 
     def _named(self, entry: Entry, dataset: str | None) -> Iterator[Item]:
         """The item of a file that is a source by itself; its folder takes the source's place."""
