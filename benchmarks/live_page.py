@@ -12,6 +12,7 @@ import argparse
 import multiprocessing
 import os
 import tempfile
+import threading
 import time
 from contextlib import nullcontext
 from pathlib import Path
@@ -22,12 +23,14 @@ from _study import environment, one_thread, save_json
 one_thread()
 
 SIZES = {"desktop": (1400, 1000), "phone": (390, 844)}
+#: Threads of the station; the first makes the simulated images, too.
+PARTS = ("acquisition", "tracking", "record", "watch", "page answers")
 SETTLED_S = 5.0  # of a page that was just opened
 TICKS_HZ = os.sysconf("SC_CLK_TCK")
 
 
-def cpu_s(pid: int, ppid_too: bool = False) -> float:
-    """Processor time of a process, or of all that come from it, too."""
+def cpu_s(pid: int, children: bool = False) -> float:
+    """Processor time of a process, and of all that come from it."""
     ticks = 0
     family = {pid}
     for number in sorted(int(name) for name in os.listdir("/proc") if name.isdigit()):
@@ -35,10 +38,21 @@ def cpu_s(pid: int, ppid_too: bool = False) -> float:
             fields = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()
         except OSError:
             continue
-        if number in family or (ppid_too and int(fields[1]) in family):
+        if number in family or (children and int(fields[1]) in family):
             family.add(number)
             ticks += int(fields[11]) + int(fields[12])
     return ticks / TICKS_HZ
+
+
+def threads_s() -> dict[str, float]:
+    """Processor time of the threads of this process that have most to do, by their names."""
+    found: dict[str, float] = {}
+    for thread in threading.enumerate():
+        text = Path(f"/proc/self/task/{thread.native_id}/stat").read_text()
+        ticks = sum(map(int, text.rpartition(")")[2].split()[11:13]))
+        name = next((word for word in PARTS if word in thread.name), "other")
+        found[name] = found.get(name, 0.0) + ticks / TICKS_HZ
+    return {f"  {name}": found.get(name, 0.0) for name in PARTS}
 
 
 def look_on(line: Any, url: str, chromium: str) -> None:
@@ -73,7 +87,8 @@ def measured(channel: Any, pids: dict[str, int], line: Any, seconds: float) -> d
         return line.recv()
 
     def used() -> dict[str, float]:
-        return {name: cpu_s(pid, name == "browser") for name, pid in pids.items()}
+        processes = {name: cpu_s(pid, name == "browser") for name, pid in pids.items()}
+        return {"station": processes.pop("station"), **threads_s(), **processes}
 
     before, updates_before = channel.status(), updates()
     count, start_s, used_before = channel.recent.count, time.monotonic(), used()
@@ -90,7 +105,7 @@ def measured(channel: Any, pids: dict[str, int], line: Any, seconds: float) -> d
         "latency, 99 % / ms": float(np.quantile(latency_ms, 0.99)),
         "latency, longest / ms": float(latency_ms.max()),
         **{f"{name} updates / s": (after[name] - updates_before[name]) / span_s for name in after},
-        **{f"{name} / %": 100 * (used_s[name] - used_before[name]) / span_s for name in pids},
+        **{f"{name} / %": 100 * (used_s[name] - used_before[name]) / span_s for name in used_s},
     }
 
 

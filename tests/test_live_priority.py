@@ -87,6 +87,21 @@ def test_threads_inherit_it_and_it_ends() -> None:
     assert now() == before or not told
 
 
+def test_threads_that_were_there_before_are_raised_too() -> None:
+    """Such as those of linear algebra, which begin when numpy is loaded."""
+    going_on = threading.Event()
+    thread = threading.Thread(target=going_on.wait)
+    thread.start()
+    number = thread.native_id
+    assert number is not None
+    before = os.sched_getscheduler(number), os.getpriority(os.PRIO_PROCESS, number)
+    with before_others(channels=0):
+        assert (os.sched_getscheduler(number), os.getpriority(os.PRIO_PROCESS, number)) == now()
+    assert (os.sched_getscheduler(number), os.getpriority(os.PRIO_PROCESS, number)) == before
+    going_on.set()
+    thread.join()
+
+
 def test_a_process_that_gives_way() -> None:
     """Even if it was started by one in real time."""
     found = []
