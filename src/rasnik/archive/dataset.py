@@ -13,6 +13,7 @@ import json
 import os
 import re
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from hashlib import blake2b
 from pathlib import Path
@@ -32,6 +33,7 @@ _JOURNAL = "_journal.jsonl"  # readers of Parquet leave out names that begin wit
 _UNFINISHED = "_unfinished-"
 _PART = re.compile(rf"({_UNFINISHED})?part-[0-9a-f]+\.parquet")
 _FORMAT = "rasnik archive 1"
+_WRITERS = 8
 
 
 class DatasetError(ValueError):
@@ -79,7 +81,10 @@ class _Line:
     @property
     def paths(self) -> dict[str, int]:
         """Size of each part by its path below the dataset."""
-        return {_part_path(self.instrument, day, self.chunk): size for day, _, size in self.parts}
+        folder = _folder(self.instrument)
+        return {
+            os.path.join(folder, _part_name(day, self.chunk)): size for day, _, size in self.parts
+        }
 
 
 def _values(settings: InstrumentSettings, track: bool) -> str:
@@ -132,9 +137,10 @@ class Dataset:
         self._instruments: dict[str, str] = {}  # and the key of their settings
         self._settings: dict[str, str] = {}  # by key
         self.removed = 0
-        journal = _prepare(path)
+        journal = _journal(path)
         self._lock = FileLock(journal)
         try:
+            _prepare(path, journal)
             self._read(journal)
             self._journal = journal.open("ab")
         except BaseException:
@@ -197,8 +203,9 @@ class Dataset:
     def store(self, work: Work, result: Result) -> None:
         """Write the rows of a chunk, then that it is done."""
         chunk = work.chunk
-        for part in result.parts:
-            self._write(self.path / _part_path(chunk.instrument, part.day, chunk.name), part)
+        folder = self.path / _folder(chunk.instrument)
+        with ThreadPoolExecutor(_WRITERS) as pool:  # each waits for the disk
+            list(pool.map(lambda part: _write(folder, chunk.name, part), result.parts))
         line = _Line(
             chunk.name,
             chunk.instrument,
@@ -225,21 +232,24 @@ class Dataset:
         self._journal.flush()
         os.fsync(self._journal.fileno())
 
-    def _write(self, path: Path, part: Part) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_name(_UNFINISHED + path.name)
-        with unfinished.open("wb") as file:
-            file.write(part.data)
-            file.flush()
-            os.fsync(file.fileno())
-        unfinished.replace(path)
+
+def _write(folder: Path, chunk: str, part: Part) -> None:
+    """Write a part, complete or not at all."""
+    path = folder / _part_name(part.day, chunk)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_name(_UNFINISHED + path.name)
+    with unfinished.open("wb") as file:
+        file.write(part.data)
+        file.flush()
+        os.fsync(file.fileno())
+    unfinished.replace(path)
 
 
 # ------------------------------------------------------------------------ files
 
 
-def _prepare(path: Path) -> Path:
-    """The journal of a dataset, which is begun if there is none."""
+def _journal(path: Path) -> Path:
+    """The journal of a dataset; an empty one if there is none."""
     journal = path / _JOURNAL
     if path.exists() and not path.is_dir():
         raise DatasetError(f"{path} is a file, not a folder with a dataset; name another")
@@ -249,18 +259,23 @@ def _prepare(path: Path) -> Path:
                 f"{path} holds something else than a dataset of this program; name a new folder"
             )
         path.mkdir(parents=True, exist_ok=True)
+        journal.touch()
+    return journal
+
+
+def _prepare(path: Path, journal: Path) -> None:
+    """Begin a journal, or see that it can be gone on with."""
     with journal.open("ab+") as file:
         file.seek(0)
         head = file.readline()
         if not head.endswith(b"\n"):  # new, or killed when it was
             file.truncate(0)
             file.write(json.dumps({"format": _FORMAT, "software": __version__}).encode() + b"\n")
-            return journal
+            return
         file.seek(-1, os.SEEK_END)
         if file.read(1) != b"\n":  # a line that was being written
             file.write(b"\n")
     _check(path, head)
-    return journal
 
 
 def _check(path: Path, head: bytes) -> None:
@@ -314,8 +329,8 @@ def _folder(instrument: str) -> str:
     return f"instrument={quote(readable, safe='')}"
 
 
-def _part_path(instrument: str, day: str, chunk: str) -> str:
-    return os.path.join(_folder(instrument), f"day={day}", f"part-{chunk}.parquet")
+def _part_name(day: str, chunk: str) -> str:
+    return os.path.join(f"day={day}", f"part-{chunk}.parquet")
 
 
 # ------------------------------------------------------------------------ reading

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 __all__ = ["archive_progress"]
 
-_RECENT_S = 60.0  # over which the rate is averaged
+_RECENT_S = 120.0  # over which the rate is averaged, and so many chunks of each worker at least
+_RECENT_CHUNKS = 4
 
 
 class _Total:
@@ -85,17 +86,16 @@ def archive_progress(run: ArchiveRun) -> Iterator[Callable[[Progress], None]]:
 
 def _rate(progress: Progress, recent: deque[tuple[float, int]]) -> str:
     """Images per second of late, in all and for each process."""
-    now_s = time.monotonic()
+    now_s, workers = time.monotonic(), max(progress.workers, 1)
     if progress.images != recent[-1][1]:
         recent.append((now_s, progress.images))
-    while len(recent) > 2 and recent[0][0] < now_s - _RECENT_S:
+    while len(recent) > _RECENT_CHUNKS * workers and recent[0][0] < now_s - _RECENT_S:
         recent.popleft()
-    (first_s, first), (_, last) = recent[0], recent[-1]
+    (first_s, first), (last_s, last) = recent[0], recent[-1]
     if last == first:
         return ""
-    rate = (last - first) / max(now_s - first_s, 1e-9)
-    each = rate / max(progress.workers, 1)
-    return f"{rate:.4g} images/s, {each:.4g} for each of {progress.workers} workers"
+    rate = (last - first) / max(last_s - first_s, 1e-9)
+    return f"{rate:.4g} images/s, {rate / workers:.4g} for each of {workers} workers"
 
 
 def _remarks(progress: Progress) -> str:

@@ -123,6 +123,8 @@ def _rate(totals: Totals) -> float | None:
 
 def _print_table(totals: dict[str, Totals]) -> None:
     """Instruments, those with most failures first; of all runs."""
+    if not totals:
+        return
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("instrument", overflow="fold")
     for heading in ("images", "with a position", "without", "images/s of a process"):
