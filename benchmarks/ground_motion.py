@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -197,17 +197,15 @@ def recovered(
     band_hz = setting.low_hz, setting.high_hz
     readings = [even_series(track, axis) for axis in AXES]
 
-    def own(method: Any, of: Callable[[Series], Series]) -> list[np.ndarray]:
-        return [
-            ground_motion(of(one), MASS, quantity, band_hz=band_hz, method=method).values
-            for one in readings
-        ]
+    def own(series: list[Series], **how: Any) -> list[np.ndarray]:
+        return [ground_motion(one, MASS, quantity, band_hz=band_hz, **how).values for one in series]
 
+    without = [without_exposure(one) for one in readings]
     return {
-        "division by the response": own("frequency", without_exposure),
-        "equation of motion": own("time", without_exposure),
+        "division by the response": own(readings, exposure_s=EXPOSURE_S),
+        "equation of motion": own(without, method="time"),
         "obspy remove_response": by_obspy(setting, track, folder, quantity),
-        "exposure left in": own("frequency", lambda one: one),
+        "exposure left in": own(readings),
     }
 
 
@@ -302,7 +300,7 @@ def plot_motion(setting: Setting, track: Track, grounds: np.ndarray, path: Path)
     truth = at_frames(grounds[0], setting)
     series = even_series(track, "x_um")
     band_hz = setting.low_hz, setting.high_hz
-    found = ground_motion(without_exposure(series), MASS, "displacement", band_hz=band_hz)
+    found = ground_motion(series, MASS, "displacement", band_hz=band_hz, exposure_s=EXPOSURE_S)
     upper.plot(t_s, track.x_um - track.x_um.mean(), lw=0.6, color="tab:gray")
     upper.set(ylabel="reading x, um", title="what the Rasnik reads")
     middle.plot(t_s, truth, lw=0.8, color="black", label="true")

@@ -59,6 +59,33 @@ def test_motion_in_the_band_comes_back(
     assert error.std() < 4e-3 * true[there].std()  # the Butterworth filters: 0.4 % at the ends
 
 
+def test_the_mean_over_the_exposure_is_undone(rng: np.random.Generator) -> None:
+    """Of a sine the mean is known in closed form, and where it is."""
+    f_hz, exposure_s = 5.0, 0.018
+    t = np.arange(round(300 * RATE_HZ)) / RATE_HZ
+    shown = np.sin(2 * np.pi * f_hz * t) * np.sinc(f_hz * exposure_s)
+    series = reading_of_ground(Series(shown, RATE_HZ), MASS)
+    left_in, undone = (
+        ground_motion(series, MASS, "displacement", band_hz=BAND_HZ, exposure_s=one).values
+        for one in (0.0, exposure_s)
+    )
+    there = np.isfinite(undone)
+    true = np.sin(2 * np.pi * f_hz * t)[there]
+    assert (undone[there] @ true) / (true @ true) == pytest.approx(1, abs=2e-4)
+    assert (left_in[there] @ true) / (true @ true) == pytest.approx(0.987, abs=1e-3)
+    plain, raised = (
+        readout_rms(1.0, RATE_HZ, MASS, "displacement", band_hz=(4.9, 5.1), exposure_s=one)
+        for one in (0.0, exposure_s)
+    )
+    assert 1.005 < raised / plain < 1.03
+    for wrong, method, sentence in (
+        (0.021, "frequency", "does not fit between frames"),
+        (0.01, "time", "in the frequency domain only"),
+    ):
+        with pytest.raises(ValueError, match=sentence):
+            ground_motion(series, MASS, band_hz=BAND_HZ, exposure_s=wrong, method=method)
+
+
 def test_the_two_ways_agree_on_noise_with_drift(rng: np.random.Generator) -> None:
     """Nothing is known of this motion, and most of it lies outside the band."""
     n = round(600 * RATE_HZ)

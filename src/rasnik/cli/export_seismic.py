@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rasnik.cli.common import fail, numbers
-from rasnik.cli.files import system_for
+from rasnik.cli.files import exposure_of
 from rasnik.cli.seismic_options import OnMass
 
 if TYPE_CHECKING:
@@ -137,7 +137,9 @@ def export_seismic(
         _directions(options.channels),
         suspension=_suspension(options),
         start_s=_start_s(options.start),
-        exposure_s=_exposure_s(path, track, options),
+        exposure_s=options.exposure_s
+        if options.exposure_s is not None
+        else exposure_of(path, track),
         encoding="FLOAT64" if options.count_nm is None else "STEIM2",
         count_nm=options.count_nm,
     )
@@ -207,10 +209,3 @@ def _start_s(text: str | None) -> float | None:
     except ValueError:
         fail(f"--start {text!r} is not a time such as 2026-11-23T02:10:00.")
     return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-
-
-def _exposure_s(path: Path, track: Track, options: SeismicOptions) -> float:
-    if options.exposure_s is not None:
-        return options.exposure_s
-    system = system_for(path, track, [])
-    return 0.0 if system is None else system.sensor.exposure_s or 0.0

@@ -19,6 +19,7 @@ __all__ = [
     "TRACK_FILES",
     "PlotOption",
     "check_outputs",
+    "exposure_of",
     "read_stored",
     "save_json",
     "stored_track",
@@ -86,6 +87,12 @@ def system_for(path: Path | str, track: Track, overrides: list[str]) -> System |
         return load_system(System.model_validate(tomllib.loads(text)), overrides)
     except (SystemConfigError, ValueError) as error:
         fail(f"{path}: the system stored with the track cannot be read: {error}")
+
+
+def exposure_of(path: Path | str, track: Track) -> float:
+    """Exposure of a frame in s, by the system stored with a track; 0 if it is not known."""
+    system = system_for(path, track, [])
+    return 0.0 if system is None else system.sensor.exposure_s or 0.0
 
 
 def save_json(path: Path, document: dict[str, Any], *, quiet: bool) -> None:

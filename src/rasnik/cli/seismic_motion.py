@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rasnik.cli.common import fail, messages, output
-from rasnik.cli.files import check_outputs, read_stored, written
+from rasnik.cli.files import check_outputs, exposure_of, read_stored, written
 from rasnik.cli.seismic_options import (
     PLOTS,
     Axis,
@@ -78,6 +78,15 @@ def ground_command(
     method: Annotated[
         _Method, typer.Option(help="Transforms, or the equation of motion in time.")
     ] = _Method.frequency,
+    exposure_s: Annotated[
+        float | None,
+        typer.Option(
+            "--exposure",
+            metavar="S",
+            help="Of a frame, whose mean is undone; by default that of the track's system. Not "
+            "with --method time.",
+        ),
+    ] = None,
     rate_hz: RateOption = None,
     sigma_nm: SigmaOption = None,
     output_file: Annotated[
@@ -114,6 +123,8 @@ def ground_command(
     from rasnik.seismic.ground import ground_motion
 
     track = read_stored(track_file)
+    if exposure_s is None:
+        exposure_s = 0.0 if method is _Method.time else exposure_of(track_file, track)
     motions: dict[str, GroundMotion] = {}
     sigmas = {name: _sigma_nm(track, name, sigma_nm) for name in names}
     for name in names:
@@ -125,6 +136,7 @@ def ground_command(
                 band_hz=band,
                 sigma=sigmas[name] if math.isfinite(sigmas[name]) else None,
                 method=method.value,
+                exposure_s=exposure_s,
             )
         except ValueError as error:
             fail(f"{track_file}, {name}: {str(error).rstrip('.')}.")

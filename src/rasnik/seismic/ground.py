@@ -75,6 +75,7 @@ def ground_motion(
     sigma: float | None = None,
     method: Method = "frequency",
     edge_s: float | None = None,
+    exposure_s: float = 0.0,
 ) -> GroundMotion:
     """Motion of the ground in a band of frequencies.
 
@@ -94,6 +95,9 @@ def ground_motion(
         code but the cutting of the ends, and agree within the band.
     edge_s : float, optional
         Time cut off at each end of every stretch; by default 6 periods of the lowest frequency.
+    exposure_s : float
+        A frame shows the mean over its exposure, which lowers the reading by sinc(f * exposure):
+        1.6 % at f = 0.1 / exposure. That is undone for this exposure, with ``method="frequency"``.
 
     Returns
     -------
@@ -104,13 +108,12 @@ def ground_motion(
     ------
     ValueError
         If the series is no length, the band does not fit the rate, no stretch without a gap is
-        long enough, or, for ``method="time"``, the damping is structural.
+        long enough, the exposure is longer than a frame, or, for ``method="time"``, the damping is
+        structural or there is an exposure to undo.
 
     Notes
     -----
-    The mean and the slope of every stretch are taken away first. A frame shows the mean over its
-    exposure, which lowers the reading by sinc(f * exposure): 1.6 % at f = 0.1 / exposure. This is
-    not undone.
+    The mean and the slope of every stretch are taken away first.
     """
     if series.unit not in _LENGTHS:
         raise ValueError(
@@ -118,6 +121,7 @@ def ground_motion(
             "off x_um or y_um"
         )
     corners = _corners(band_hz, series.rate_hz, method)
+    _check_exposure(exposure_s, series.rate_hz, method)
     edge = _edge_s(edge_s, band_hz)
     cut = math.ceil(edge * series.rate_hz)
     values = np.full(len(series), np.nan)
@@ -127,7 +131,7 @@ def ground_motion(
             too_short += 1
             continue
         if method == "frequency":
-            found = _divided(run, series.rate_hz, suspension, quantity, corners, cut)
+            found = _divided(run, series.rate_hz, suspension, quantity, corners, cut, exposure_s)
         else:
             found = inverse_in_time(_detrended(run), series.rate_hz, suspension, quantity, band_hz)
         values[first + cut : first + len(run) - cut] = found[cut : len(run) - cut]
@@ -142,7 +146,13 @@ def ground_motion(
     noise = math.nan
     if sigma is not None:
         noise = readout_rms(
-            sigma, series.rate_hz, suspension, quantity, band_hz=band_hz, method=method
+            sigma,
+            series.rate_hz,
+            suspension,
+            quantity,
+            band_hz=band_hz,
+            method=method,
+            exposure_s=exposure_s,
         )
     return GroundMotion(
         values, series.rate_hz, f"ground {quantity} from {series.name}",
@@ -213,6 +223,7 @@ def readout_rms(
     *,
     band_hz: tuple[float, float],
     method: Method = "frequency",
+    exposure_s: float = 0.0,
 ) -> float:
     """Standard deviation that white noise of the readings gives `ground_motion` in a band."""
     from scipy.integrate import trapezoid
@@ -223,7 +234,7 @@ def readout_rms(
     if method == "time":
         gain = inverse_gain(f_hz, rate_hz, suspension, quantity, band_hz)
     else:
-        gain = np.abs(_inverse(f_hz, suspension, quantity, corners))
+        gain = np.abs(_inverse(f_hz, suspension, quantity, corners, exposure_s))
     return sigma * math.sqrt(2 / rate_hz * float(trapezoid(gain**2 * f_hz, np.log(f_hz))))
 
 
@@ -235,12 +246,14 @@ def _inverse(
     suspension: Suspension,
     quantity: Quantity,
     corners: tuple[float, float, float, float],
+    exposure_s: float,
 ) -> NDArray[np.complex128]:
-    """Taper over response; 0 where the taper is."""
+    """Taper over the response of suspension and exposure; 0 where the taper is."""
     inside = taper(f_hz, corners)
     found = np.zeros(len(f_hz), dtype=complex)
     used = inside > 0
-    found[used] = inside[used] / suspension.reading(f_hz[used], quantity)
+    shown = suspension.reading(f_hz[used], quantity) * np.sinc(f_hz[used] * exposure_s)
+    found[used] = inside[used] / shown
     return found
 
 
@@ -251,6 +264,7 @@ def _divided(
     quantity: Quantity,
     corners: tuple[float, float, float, float],
     cut: int,
+    exposure_s: float,
 ) -> NDArray[np.float64]:
     """A stretch divided by the response; its first and last `cut` values do not count."""
     from scipy import fft
@@ -263,7 +277,7 @@ def _divided(
     # As many zeros behind it that what the filter spreads does not come round.
     length = fft.next_fast_len(len(run) + 2 * cut, real=True)
     f_hz = fft.rfftfreq(length, 1 / rate_hz)
-    spectrum = fft.rfft(shown, length) * _inverse(f_hz, suspension, quantity, corners)
+    spectrum = fft.rfft(shown, length) * _inverse(f_hz, suspension, quantity, corners, exposure_s)
     return np.asarray(fft.irfft(spectrum, length)[: len(run)])
 
 
@@ -298,6 +312,19 @@ def _corners(
             f"the band ends at {high:g} Hz, above {most:g} Hz, {share} the rate of {rate_hz:g} Hz"
         )
     return low / 2, low, high, min(2 * high, rate_hz / 2)
+
+
+def _check_exposure(exposure_s: float, rate_hz: float, method: Method) -> None:
+    # a little longer than a frame is how a rate was rounded
+    if not 0 <= exposure_s * rate_hz <= 1.001:
+        raise ValueError(
+            f"an exposure of {exposure_s:g} s does not fit between frames at {rate_hz:g} Hz; give "
+            "seconds from 0 to one over the rate"
+        )
+    if exposure_s and method == "time":
+        raise ValueError(
+            "the exposure is undone in the frequency domain only; take that method, or no exposure"
+        )
 
 
 def _edge_s(edge_s: float | None, band_hz: tuple[float, float]) -> float:
