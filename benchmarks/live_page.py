@@ -18,9 +18,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-from _study import environment, one_thread, save_json
-
-one_thread()
+from _study import environment, save_json
 
 SIZES = {"desktop": (1400, 1000), "phone": (390, 844)}
 #: Threads of the station; the first makes the simulated images, too.
@@ -159,8 +157,10 @@ def main() -> None:
     parser.add_argument("--json", help="write the results to this file")
     arguments = parser.parse_args()
 
+    from rasnik.live.linear_algebra import in_one_thread
     from rasnik.live.priority import before_others
 
+    in_one_thread()
     raised = nullcontext("") if arguments.not_raised else before_others(1)
     with raised as priority:
         results = run(arguments)

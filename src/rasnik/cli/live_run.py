@@ -28,8 +28,10 @@ _OVER = ("ended", "failed")
 
 def run_live(config: StationConfig, seconds: float | None, page: bool) -> int:
     """Run a station until a signal, the time, or the end of all its channels; the exit status."""
+    from rasnik.live.linear_algebra import in_one_thread
     from rasnik.live.priority import before_others
 
+    in_one_thread()
     with _asked_to_end() as asked, before_others(len(config.channel)):
         from rasnik.live.service import Station
 

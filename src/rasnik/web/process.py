@@ -237,6 +237,5 @@ class _Child:
 
 
 def _environment() -> dict[str, str]:
-    """The same modules as here; linear algebra in one thread, as there is next to none."""
-    one = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    return {**os.environ, **one, "PYTHONPATH": os.pathsep.join(sys.path)}
+    """The same modules as here."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}

@@ -14,6 +14,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection
 from typing import Any, cast
 
+from rasnik.live.linear_algebra import in_one_thread
 from rasnik.live.priority import give_way
 
 __all__ = ["main"]
@@ -23,6 +24,7 @@ def main() -> None:
     """Serve until the station says stop, or is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the station, which ends this
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    in_one_thread()
     give_way()  # before anything is loaded, which takes a second
     from rasnik.web.line import Line
     from rasnik.web.remote import Plan, RemoteStation

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rasnik.live.checks.finding import Finding, Machine
 from rasnik.live.checks.machine import cores_to_use
 from rasnik.live.checks.rates import frame_rate_hz, system_of
+from rasnik.live.linear_algebra import in_one_thread
 from rasnik.live.station import ChannelConfig, StationConfig
 
 __all__ = ["Measured", "Stream", "analysis_rate", "judged", "measure"]
@@ -96,6 +97,7 @@ class Stream:
 
 def measure(channels: Sequence[ChannelConfig], seconds: float = _TOTAL_S) -> list[Measured]:
     """All channels at a time, each as fast as it goes, in a thread of its own as at a station."""
+    in_one_thread()
     streams = [Stream(channel) for channel in channels]
     for stream in streams:
         for _ in range(_WARM):
