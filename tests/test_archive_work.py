@@ -99,6 +99,16 @@ def test_tracking_begins_again_after_images_without_a_mask():
     assert not found[4].flags & Flag.COLD_START
 
 
+@pytest.mark.parametrize("level", [0, 30, 255])
+def test_an_image_without_any_contrast_has_no_position(level):
+    """Whatever was seen before it."""
+    blank = np.full(SMALL.shape, level, np.uint8)
+    for frame in FRAMES[:6]:
+        followed = Poses(SETTINGS)
+        found = [followed.of(Frame("f", k, image))[0] for k, image in enumerate([frame, blank])]
+        assert [pose.ok for pose in found] == [True, False]
+
+
 def test_damaged_files_are_rows_with_their_sentence(tmp_path):
     save_folder(tmp_path / "a", 2)
     (tmp_path / "a" / "image0.png").write_bytes(b"\x89PNG nothing")
