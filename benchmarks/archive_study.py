@@ -249,7 +249,7 @@ def wait_for_rows(dataset: Path, rows: float, process: subprocess.Popen[bytes]) 
         if process.poll() is not None:
             return False
         assert time.monotonic() < end_s, "it takes too long"
-        time.sleep(0.05)
+        time.sleep(0.5)
     return True
 
 
