@@ -9,6 +9,7 @@ from array import array
 from collections.abc import Iterable
 from dataclasses import dataclass
 from hashlib import blake2b
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,13 +75,16 @@ def unpack_spans(text: str) -> list[DoneSpan]:
 class DoneFrames:
     """Finds what is left to do of an item.
 
-    Names are kept as numbers of 64 bits: 33 bytes for each span, whatever its name.
+    Names are kept as numbers of 64 bits: 56 bytes for each span, whatever its name.
     """
 
     def __init__(self) -> None:
         self._numbers = array("Q")  # name and stamp in turn
         self._frames = array("q")  # start, frames, whether to the end
-        self._keys: NDArray[np.uint64] | None = None
+        self._keys: NDArray[np.uint64] | None = None  # sorted
+        self._stamps: NDArray[Any] = np.empty(0)
+        self._spans: NDArray[Any] = np.empty(0)
+        self._order: NDArray[np.intp] = np.empty(0, dtype=np.intp)
 
     def __len__(self) -> int:
         return len(self._numbers) // 2
@@ -88,6 +92,7 @@ class DoneFrames:
     def add(self, spans: Iterable[DoneSpan]) -> None:
         """Take note of spans."""
         self._keys = None
+        self._stamps = self._spans = np.empty(0)  # were views of what grows
         for span in spans:
             self._numbers.extend((_digest(span.name), span.stamp))
             self._frames.extend((span.start, span.frames, span.to_end))
@@ -128,8 +133,8 @@ class DoneFrames:
         return self._order[first:last]
 
     def _sort(self) -> None:
-        numbers = np.array(self._numbers, dtype=np.uint64).reshape(-1, 2)
-        self._spans = np.array(self._frames, dtype=np.int64).reshape(-1, 3)
+        numbers = np.frombuffer(self._numbers, dtype=np.uint64).reshape(-1, 2)
+        self._spans = np.frombuffer(self._frames, dtype=np.int64).reshape(-1, 3)
         self._order = np.argsort(numbers[:, 0], kind="stable")
         self._keys, self._stamps = numbers[self._order, 0], numbers[:, 1]
 
