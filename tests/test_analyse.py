@@ -143,6 +143,27 @@ def test_a_prior_is_no_position_of_an_image_without_a_usable_pixel() -> None:
     assert pose.flags & Flag.BLANK and pose.flags & Flag.SATURATED
 
 
+@pytest.mark.parametrize("kind", ["constant", "noise", "clipped slope"])
+def test_a_prior_is_no_position_of_an_image_without_a_pattern(kind: str) -> None:
+    """The fit of such an image leaves nothing unexplained, and stays where the prior is."""
+    system = load_system("solidras", {"sensor.width_px": 320, "sensor.height_px": 240})
+    poses = [(4000 + 137 * k, 5000 + 211 * k, 0.002 * k) for k in range(6)]
+    frames = simulate(system, poses, seed=1).frames
+    priors = [pose for pose in (analyse(frame, system) for frame in frames) if pose.ok]
+    assert len(priors) > 3
+    for k, prior in enumerate(priors):
+        rng = np.random.default_rng(k)
+        for level in (0.0, 1.0, 30.0):
+            image = np.full(system.shape, level)
+            if kind != "constant":
+                image += rng.normal(0, np.sqrt(0.26 + 0.011 * level), system.shape)
+            if kind == "clipped slope":
+                image += np.linspace(-20, 20, 320)
+            grey = np.clip(np.rint(image), 0, 255).astype(np.uint8)
+            assert not analyse(grey, system, prior=prior).ok
+            assert not analyse(grey, field_um=85.0, pixel_um=6.9, prior=prior).ok
+
+
 def test_a_prior_is_not_proven_by_a_corner_without_code() -> None:
     before = analyse(frame_at(), SMALL)
     frame = frame_at((POSE[0] + 85, POSE[1] + 85, POSE[2])).copy()

@@ -17,7 +17,13 @@ from rasnik.analysis.decode import Decoding, LabelledLattice, decode
 from rasnik.analysis.flags import FLAGS, Flag
 from rasnik.analysis.fourier import find_lattice
 from rasnik.analysis.fourier_pose import fourier_pose
-from rasnik.analysis.frame import Bounds, Frame, prepare_frame, resolve_instrument
+from rasnik.analysis.frame import (
+    ROUNDING_VARIANCE,
+    Bounds,
+    Frame,
+    prepare_frame,
+    resolve_instrument,
+)
 from rasnik.analysis.lattice import Lattice
 from rasnik.analysis.likelihood import Fit, fit
 from rasnik.analysis.parameters import Model, State
@@ -38,6 +44,10 @@ _MOST_MOTION_FIELDS = 0.35
 _PRIOR_MOTION_FIELDS = 0.8
 _LEAST_EXPLAINED = 0.5
 _PRIOR_EXPLAINED = 0.9
+# There is a pattern if its amplitude is so many times what noise makes of none, and if it tells
+# the position to this part of a field.
+_LEAST_SIGNIFICANCE = 20.0
+_MOST_SIGMA_FIELDS = 0.02
 # What is left of a flash or a border does not tell whole fields apart: of the pixels that the
 # prior rests on, as many must be there.
 _PRIOR_PIXELS = 0.5
@@ -185,7 +195,12 @@ def _refined(
     # a first estimate is affine: where a tilted mask needs more, only its centre is right
     centre_only = result.model == "projective"
     moved = _motion_fields(frame, start.projection, result.state.projection, centre_only)
-    if moved > _MOST_MOTION_FIELDS or result.explained < _LEAST_EXPLAINED or not result.converged:
+    if (
+        not result.converged
+        or moved > _MOST_MOTION_FIELDS
+        or result.explained < _LEAST_EXPLAINED
+        or not _shows_pattern(frame, result)
+    ):
         flags |= Flag.NOT_CONVERGED
     return replace(
         _pose(frame, result, best.orientation, flags),
@@ -238,6 +253,7 @@ def _from_prior(
         not (result.converged and result.clean)
         or moved > _PRIOR_MOTION_FIELDS
         or result.explained < _PRIOR_EXPLAINED
+        or not _shows_pattern(frame, result)
     ):
         return None
     pose = _pose(frame, result, prior.orientation, flags)
@@ -252,6 +268,24 @@ def _from_prior(
 
 
 # --------------------------------------------------------------------- results
+
+
+def _shows_pattern(frame: Frame, result: Fit) -> bool:
+    """Whether the image says where the mask is. Of one without a pattern a fit leaves nothing
+    unexplained either, and stays where it began.
+    """
+    appearance = result.state.appearance
+    dark, light = float(appearance.dark[0]), float(appearance.light[0])
+    variance = result.noise[0] + result.noise[1] * max(light, 0.0)
+    sample = frame.image[::3, ::3]
+    if (sample == np.rint(sample)).all():  # clipped noise may seem to be none
+        variance = max(variance, ROUNDING_VARIANCE)
+    variance *= max(result.chi2_ndf, 1.0)
+    significance = 0.5 * (light - dark) * np.sqrt(np.count_nonzero(result.valid) / variance)
+    sigma_um = np.sqrt(np.diag(result.covariance)[:2].max())
+    return bool(
+        significance > _LEAST_SIGNIFICANCE and sigma_um < _MOST_SIGMA_FIELDS * frame.mask.field_um
+    )
 
 
 def _motion_fields(

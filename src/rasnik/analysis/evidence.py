@@ -147,10 +147,11 @@ def pose_covariance(
     covariance = solution.inverse[:4, :4].copy()
     if growth is not None:
         growth = np.maximum(np.sqrt(max(1.0, solution.chi2_ndf)), growth)
-        covariance *= np.outer(growth, growth)
+        with np.errstate(over="ignore"):  # where there is no pattern, nothing is known
+            covariance *= np.outer(growth, growth)
     scale = solution.state.projection.similarity()[0]
-    unit = np.diag([1.0, 1.0, scale, 1.0])
-    result: NDArray[np.float64] = unit @ covariance @ unit
+    unit = np.array([1.0, 1.0, scale, 1.0])
+    result: NDArray[np.float64] = covariance * np.outer(unit, unit)
     return result
 
 

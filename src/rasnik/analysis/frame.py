@@ -13,12 +13,13 @@ from rasnik.imaging.appearance import Camera
 from rasnik.instrument import System, load_system
 from rasnik.mask import ChessField
 
-__all__ = ["Bounds", "Frame", "prepare_frame", "resolve_instrument"]
+__all__ = ["ROUNDING_VARIANCE", "Bounds", "Frame", "prepare_frame", "resolve_instrument"]
 
 #: (left, top, right, bottom) pixel of the picture, all four included.
 Bounds = tuple[int, int, int, int]
 
-_ROUNDING_VARIANCE = 1 / 12
+#: Of a grey level rounded to a whole number.
+ROUNDING_VARIANCE = 1 / 12
 _SMALLEST_PX = 16
 _SATURATED_FRACTION = 0.10
 
@@ -170,5 +171,5 @@ def prepare_frame(
         flags |= Flag.SATURATED
     noise = None if system is None else system.noise_law
     if noise is not None and np.issubdtype(array.dtype, np.integer):
-        noise = (noise[0] + _ROUNDING_VARIANCE, noise[1])
+        noise = (noise[0] + ROUNDING_VARIANCE, noise[1])
     return Frame(grey, valid, picture, Camera(array.shape, pixel_um), mask, noise), flags

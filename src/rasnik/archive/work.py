@@ -235,9 +235,6 @@ class Poses:
         except Exception:  # told by `analysed`, if it lies with the frame
             self._tracker = None
             return None
-        if pose.flags & Flag.LOW_CONTRAST:  # next to nothing there: the frame has to say it alone
-            self._tracker = None
-            return None
         if pose.ok and not pose.flags & Flag.COLD_START:
             self._vain, self._leave = 0, _IN_VAIN
         else:
