@@ -36,11 +36,10 @@ __all__ = [
     "System",
     "SystemConfigError",
     "load_system",
+    "scales_contradict",
     "system_names",
 ]
 
-# Distances are measured to the middle of a lens, not to its principal planes, so the scale
-# they give is a rough one.
 _SCALE_TOLERANCE = 0.1
 
 # Up to 100 km: a light path on the Moon has some ten.
@@ -329,5 +328,13 @@ def _drop_stale_distances(data: dict[str, Any], changes: Mapping[str, Any]) -> N
 def _scale_contradicts(scale: float, geometry: Geometry) -> bool:
     if geometry.lens_sensor_mm is None or geometry.mask_lens_mm is None:
         return False
-    ratio = geometry.lens_sensor_mm / geometry.mask_lens_mm / scale
-    return abs(math.log(ratio)) > math.log1p(_SCALE_TOLERANCE)
+    return scales_contradict(geometry.lens_sensor_mm / geometry.mask_lens_mm, scale)
+
+
+def scales_contradict(one: float, other: float) -> bool:
+    """Whether two scales, or distances, differ by more than how they are measured explains.
+
+    Distances are measured to the middle of a lens, not to its principal planes, so the scale they
+    give is a rough one: 10 % are allowed.
+    """
+    return abs(math.log(one / other)) > math.log1p(_SCALE_TOLERANCE)

@@ -95,7 +95,7 @@ class ReplayCamera(Camera):
         faults += [
             f"{s.name}: there is no such file or folder"
             for s in self._sources
-            if not s.error and not s.path.exists()
+            if not s.error and s.url is None and not s.path.exists()
         ]
         if faults or not self._sources:
             raise CameraMissingError(

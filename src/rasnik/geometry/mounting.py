@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rasnik.geometry.reading import FACING, Placement, readings
 from rasnik.geometry.rigid import axes_along, rotation_matrix
+from rasnik.instrument import scales_contradict
 
 if TYPE_CHECKING:
     from rasnik.geometry.installation import Body, Installation, Rasnik
@@ -20,8 +21,6 @@ __all__ = ["Mounting", "mounting", "mounting_problems"]
 
 Array = NDArray[np.float64]
 
-# As between distances and scale of a system: distances are measured to the middle of a lens.
-_SCALE_TOLERANCE = 0.1
 # Elements nearer to each other than this are taken for the same point.
 _COINCIDENT_MM = 1e-3
 # Body axes nearer to the line than this (cosine) cannot say where X points.
@@ -135,7 +134,7 @@ def mounting_problems(installation: Installation, rasnik: Rasnik) -> Iterator[st
         return
     distances = np.linalg.norm(np.diff(placed.world_mm, axis=0), axis=1)
     scale = distances[1] / distances[0]
-    if _differ(scale, system.optics.scale):
+    if scales_contradict(scale, system.optics.scale):
         yield (
             f"the distances make a scale of {scale:.4g} (mask to lens {distances[0]:.6g} mm, lens "
             f"to sensor {distances[1]:.6g} mm), but system {system.name} has optics.scale = "
@@ -145,7 +144,7 @@ def mounting_problems(installation: Installation, rasnik: Rasnik) -> Iterator[st
         ("mask_lens_mm", distances[0], system.geometry.mask_lens_mm),
         ("lens_sensor_mm", distances[1], system.geometry.lens_sensor_mm),
     ):
-        if there is not None and _differ(here, there):
+        if there is not None and scales_contradict(here, there):
             yield (
                 f"system {system.name} has geometry.{name} = {there:g}, but the positions make it "
                 f"{here:.6g} mm"
@@ -158,7 +157,3 @@ def mounting_problems(installation: Installation, rasnik: Rasnik) -> Iterator[st
                 f"the line crosses the mask plane at ({x:.6g}, {y:.6g}) um, beside the mask, which "
                 f"ends at ({x1:.6g}, {y1:.6g}) um; check mask.point_um and the positions"
             )
-
-
-def _differ(one: float, other: float) -> bool:
-    return abs(np.log(one / other)) > np.log1p(_SCALE_TOLERANCE)

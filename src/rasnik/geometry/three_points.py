@@ -34,7 +34,7 @@ from rasnik.geometry.reading import (
 )
 from rasnik.geometry.rigid import UM_PER_MM, left_jacobian, rotation_matrix, skew
 from rasnik.imaging.projection import ORIENTATIONS
-from rasnik.instrument import System
+from rasnik.instrument import System, scales_contradict
 
 __all__ = [
     "ALL_MOTIONS",
@@ -51,10 +51,6 @@ Array = NDArray[np.float64]
 CAMERA_MOTIONS = tuple(f"camera_{kind}" for kind in ("x", "y", "z", "turn_x", "turn_y", "turn_z"))
 #: Order of motions: shifts in um, turns in rad.
 ALL_MOTIONS = MOTIONS + CAMERA_MOTIONS
-
-# Distances are measured to the middle of a lens, not to its principal planes; rasnik.instrument
-# allows as much.
-_SCALE_TOLERANCE = 0.1
 
 # Where the motions of each body stand in ALL_MOTIONS; those of an element are so in MOTIONS too.
 _MASK_SHIFT, _MASK_TURN, _LENS_SHIFT = slice(0, 3), slice(3, 6), slice(6, 9)
@@ -339,7 +335,7 @@ def three_points(
             raise ValueError(f"{name} = {value:g} must be positive")
     if mask_lens_mm is not None and lens_sensor_mm is not None:
         ratio = lens_sensor_mm / mask_lens_mm
-        if scale is not None and abs(math.log(ratio / scale)) > math.log1p(_SCALE_TOLERANCE):
+        if scale is not None and scales_contradict(ratio, scale):
             raise ValueError(
                 f"scale = {scale:g}, but lens_sensor_mm = {lens_sensor_mm:g} and mask_lens_mm = "
                 f"{mask_lens_mm:g} make a scale of {ratio:g}; give two of the three"

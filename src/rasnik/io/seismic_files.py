@@ -17,7 +17,6 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 
 from rasnik.characterisation.gaps import TOLERANCE, Series, even_series
 from rasnik.io.seed_codes import Direction, Site, channel_code
+from rasnik.io.utc import EARLIEST_S
 from rasnik.seismic.suspension import Suspension
 from rasnik.tracking.track import Track
 
@@ -55,8 +55,6 @@ _RATE_ROUNDING = 1e-7
 _LARGEST_COUNT = 2**31 - 1
 # Steim2 stores differences of at most 30 bits.
 _LARGEST_STEP = 2**29 - 1
-#: Times before this are not counted from 1970: no Rasnik had a digital camera then.
-_EARLIEST_S = datetime(1980, 1, 1, tzinfo=UTC).timestamp()
 
 
 def obspy() -> Any:
@@ -115,7 +113,7 @@ class SeismicChannel:
             raise ValueError(
                 f"{series.name} is in {series.unit or 'no unit'}; seismic files hold displacements"
             )
-        if not series.start_s >= _EARLIEST_S:
+        if not series.start_s >= EARLIEST_S:
             raise ValueError(
                 f"{series.name} begins at {series.start_s:.6g} s, which is not counted from 1970; "
                 "give the time of its first frame in UTC"
@@ -216,7 +214,7 @@ def channels_of(
     for place, (column, direction) in enumerate(known.items(), start=1):
         series = even_series(track, column)
         if start_s is not None:
-            if series.start_s >= _EARLIEST_S:
+            if series.start_s >= EARLIEST_S:
                 raise ValueError(
                     "the times of the track are counted from 1970 already; another time of its "
                     "first frame would contradict them"
