@@ -1,6 +1,7 @@
 # Everything runs in .venv, which is made here with nothing but Python's own venv and pip.
 PYTHON ?= python3
 BIN := .venv/bin
+PYTEST := $(BIN)/python -m pytest
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 SOURCES := $(wildcard src tests benchmarks)
 
@@ -43,8 +44,12 @@ $(BIN)/python:
 demo: .venv/.package
 	$(BIN)/rasnik demo $(ARGS)
 
+# Most tests run beside each other, then those of what happens in time (status 5: none chosen).
 test: .venv/.dev .venv/.camera
-	$(BIN)/python -m pytest $(ARGS)
+	@status=0; \
+	$(PYTEST) -n auto --dist loadfile -m "not timed" $(ARGS) || [ $$? -eq 5 ] || status=1; \
+	$(PYTEST) -m timed $(ARGS) || [ $$? -eq 5 ] || status=1; \
+	exit $$status
 
 lint: .venv/.dev
 	$(BIN)/ruff check $(SOURCES)

@@ -6,7 +6,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+# Tests of what happens in time: cameras, stations, pages, processes that are killed. They run one
+# after the other, the rest beside each other (Makefile).
+TIMED = (
+    *("test_archive_run", "test_cameras_", "test_cli_archive", "test_cli_live", "test_controls_"),
+    *("test_doctor", "test_live_", "test_recording_", "test_track_file", "test_warm_up"),
+    "test_web_",
+)
+
 SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if item.path.name.startswith(TIMED):
+            item.add_marker("timed")
 
 
 @pytest.fixture(scope="session")
