@@ -399,28 +399,49 @@ def scheduled_run(
             daemon.wait()
 
 
-def throughput(
-    archive: Path, truths: list[Truth], options: argparse.Namespace
-) -> tuple[float, float, float]:
-    """Images per second: a plain loop, as many plain loops at once as workers, and a worker."""
+@dataclass(frozen=True)
+class Speed:
+    """Images per second and process."""
+
+    alone: float
+    """A plain loop with the machine to itself."""
+    together: float
+    """As many plain loops at once as there are workers, each while it works."""
+    worker: float
+    """A worker, from the first chunk to the end of the last."""
+    worker_busy: float
+    """A worker while it works."""
+
+    def __str__(self) -> str:
+        return (
+            f"  plain loop {self.alone:.1f} images/s; several at once {self.together:.1f} each\n"
+            f"  a worker {self.worker:.1f} in the whole run, {self.worker_busy:.1f} while it "
+            f"works: {100 * self.worker / self.together:.1f} % and "
+            f"{100 * self.worker_busy / self.together:.1f} % of several loops at once"
+        )
+
+
+def throughput(archive: Path, truths: list[Truth], options: argparse.Namespace) -> Speed:
+    """How fast it is, on some of the instruments."""
     chosen = [truth.instrument for truth in truths[: options.timed]]
     sources = [str(archive / name) for name in chosen]
     n = sum(len(truth.file) for truth in truths[: options.timed])
     plain_loop(sources[:1])  # compiled code is loaded
-    start_s = time.perf_counter()
-    assert plain_loop(sources) == n
-    plain = n / (time.perf_counter() - start_s)
+    found, alone_s = plain_loop(sources)
     with ProcessPoolExecutor(options.workers) as pool:
         shares = [sources[k :: options.workers] for k in range(options.workers)]
         list(pool.map(plain_loop, [sources[:1]] * options.workers))
-        start_s = time.perf_counter()
-        assert sum(pool.map(plain_loop, shares)) == n
-        together = n / (time.perf_counter() - start_s) / options.workers
-    return plain, together, archived(sources, archive.parent / "timed", n, options.workers)
+        together = list(pool.map(plain_loop, shares))
+    assert found == n == sum(images for images, _ in together)
+    return Speed(
+        n / alone_s,
+        n / sum(seconds for _, seconds in together),
+        *archived(sources, archive.parent / "timed", n, options.workers),
+    )
 
 
-def plain_loop(sources: list[str]) -> int:
-    """The function that the workers call, called in a loop; number of images."""
+def plain_loop(sources: list[str]) -> tuple[int, float]:
+    """The function that the workers call, called in a loop; images, and seconds that it took."""
     from rasnik.archive.done import DoneFrames
     from rasnik.archive.plan import Planner
     from rasnik.archive.sources import find_items
@@ -430,11 +451,15 @@ def plain_loop(sources: list[str]) -> int:
     settings = InstrumentSettings(small_system())
     planner = Planner(lambda name: settings, DoneFrames())
     works = (Work(chunk, settings) for chunk in planner.chunks(find_items(sources)))
-    return sum(sum(analyse_chunk(work).found) for work in works)
+    start_s = time.perf_counter()
+    n = sum(sum(analyse_chunk(work).found) for work in works)
+    return n, time.perf_counter() - start_s
 
 
-def archived(sources: list[str], dataset: Path, n: int, workers: int) -> float:
-    """Images per second of each worker, from the first chunk that is given out to the end."""
+def archived(sources: list[str], dataset: Path, n: int, workers: int) -> tuple[float, float]:
+    """Images per second of each worker: of the whole run, in which one has the last chunk while
+    the others wait; and while it works.
+    """
     from rasnik.archive.cluster import dask_pool
     from rasnik.archive.dataset import Dataset
     from rasnik.archive.run import ArchiveRun, absolute_sources
@@ -448,7 +473,8 @@ def archived(sources: list[str], dataset: Path, n: int, workers: int) -> float:
             run = ArchiveRun(absolute_sources(sources), table, written)
             run.run(pool)
     assert sum(total.images for total in run.totals.values()) == n
-    return n / run.elapsed_s / workers
+    worked_s = sum(total.seconds for total in run.totals.values())
+    return n / run.elapsed_s / workers, n / worked_s
 
 
 def total_of(truths: list[Truth]) -> int:
@@ -492,12 +518,7 @@ def study(folder: Path, options: argparse.Namespace) -> None:
         f"{time.monotonic() - begin_s:.0f} s"
     )
     tell("a plain loop, and the workers, on the same images:")
-    plain, together, each = throughput(archive, truths, options)
-    print(
-        f"  plain loop {plain:.1f} images/s; {options.workers} of them at once {together:.1f} "
-        f"each; a worker {each:.1f}: {100 * each / plain:.1f} % of the plain loop, "
-        f"{100 * each / together:.1f} % of several at once"
-    )
+    print(throughput(archive, truths, options))
     tell("workers and runs killed:")
     killed_run(archive, table, truths, options)
     tell("a scheduler and workers of their own, one killed:")

@@ -73,7 +73,8 @@ class Limits:
     """How large a chunk may be.
 
     A frame takes from 1 ms (small, tracked) to 0.3 s (4 megapixels, found from nothing): these
-    limits make chunks of seconds to a minute.
+    limits make chunks of a second to some minutes. Larger ones would leave one worker long with
+    the last.
 
     Attributes
     ----------
@@ -86,7 +87,7 @@ class Limits:
         Spans that may wait for others of their instrument, where instruments take turns.
     """
 
-    frames: int = 2000
+    frames: int = 500
     size: int = 256 << 20
     counted: int = 8 << 20
     waiting: int = 20_000
