@@ -380,8 +380,8 @@ class Channel:
         state = self._acquisition.state
         if state == "running" and self._latest is None:
             return "starting"
-        if state == "ended" and not self._ring.finished:
-            return "running"
+        if state == "ended" and self._threads[0].is_alive():
+            return "running"  # the last frames are still tracked
         return state
 
     def _message(self) -> str:
