@@ -13,6 +13,7 @@ from rasnik.geometry.installation import Installation, load_installation
 from rasnik.geometry.network import Network
 from rasnik.geometry.observations import Readings, parse_readings
 from rasnik.geometry.outliers import FALSE_ALARM, snoop
+from rasnik.geometry.rigid import DOFS
 from rasnik.geometry.solution import Adjustment
 from test_geometry_installation import random_network
 
@@ -281,6 +282,25 @@ def test_combinations_are_named_with_their_proportion() -> None:
     assert "mm along x" in one.words and "mrad about y" in one.words
     assert list(found.measured[0]) == [False, True, False, False, False, False]
     assert found.free[0].tolist() == [True, True, False, False, True, False]
+
+
+@pytest.mark.parametrize("kept", [["A1"], ["A1", "B1"], ["B2"], ["A1", "A4", "C1"]])
+def test_no_reading_changes_with_a_motion_that_is_called_unmeasured(kept: list[str]) -> None:
+    """Also where shifts of mm go with turns of less than a mrad."""
+    text = load_installation("atlas-tower").model_dump(exclude_none=True)
+    text["rasniks"] = [one for one in text["rasniks"] if one["name"] in kept]
+    network = Network(Installation.model_validate(text))
+    sigmas = np.array([network.installation.value_sigmas(r) for r in network.installation.rasniks])
+    slopes = network.jacobian(np.zeros((3, 6))) / sigmas[..., None, None]
+    for one in capability(network).unmeasured:
+        motion = np.zeros((3, 6))
+        for label, value in one.motion.items():
+            name, dof = label.split(".")
+            motion[network.bodies.index(name), DOFS.index(dof)] = value
+        ranges = np.repeat([1e3 * text["range_mm"], text["range_rad"]], 3)
+        motion /= np.abs(motion / ranges).max()
+        seen = np.einsum("kvbd,bd->kv", slopes, motion)
+        assert np.abs(seen).max() < 1e-6, one.words
 
 
 def test_what_is_unmeasured_does_not_depend_on_the_size(rng: np.random.Generator) -> None:

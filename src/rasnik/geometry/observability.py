@@ -118,7 +118,7 @@ def name_motions(
     for motion in _rest(space, known):
         found.append(_in_words(network, free, motion * ranges))
     labels = [f"{network.bodies[b]}.{DOFS[d]}" for b, d in np.argwhere(free)]
-    named = [Unmeasured(words, kind, _largest(labels, m)) for words, kind, m in found]
+    named = [Unmeasured(words, kind, _moving(labels, m, ranges)) for words, kind, m in found]
     return _joined(named)
 
 
@@ -242,10 +242,10 @@ def _in_words(network: Network, free: NDArray[np.bool_], motion: Array) -> tuple
     return f"{' with '.join(parts[:2])}{''.join(f', {p}' for p in parts[2:])}", "combination", unit
 
 
-def _largest(labels: list[str], motion: Array) -> dict[str, float]:
-    limit = 1e-6
-    entries = zip(labels, motion.tolist(), strict=True)
-    return {label: value for label, value in entries if abs(value) > limit * np.abs(motion).max()}
+def _moving(labels: list[str], motion: Array, ranges: Array) -> dict[str, float]:
+    """What takes part in a motion by more than rounding; ranges make um and rad comparable."""
+    sizes = np.abs(motion / ranges)
+    return {labels[k]: float(motion[k]) for k in np.flatnonzero(sizes > 1e-6 * sizes.max())}
 
 
 def _joined(named: list[Unmeasured]) -> list[Unmeasured]:
