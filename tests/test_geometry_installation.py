@@ -380,6 +380,8 @@ def test_written_readings_come_back_exactly(tmp_path: Path, rng: np.random.Gener
         ({"name": "one", "x_um": 1, "scale": -1}, "scale = -1 is not positive"),
         ({"name": "one", "x_um": 1, "sigma_x_um": 0}, "sigma_x_um = 0 is not positive"),
         ({"name": "one", "x_um": 1, "orientation": 2}, "it has orientation 2, but as described"),
+        ({"name": "one", "x_um": 1, "orientation": "up"}, "orientation = 'up' is not a number"),
+        ({"name": "one", "x_um": True}, "x_um = True is not a number"),
         (
             {"name": "one", "ok": False, "flags": ["no_mask"]},
             "the reading of one is left out: its analysis failed (no_mask)",
@@ -392,6 +394,22 @@ def test_a_bad_reading_is_named_and_the_rest_used(row: Any, sentence: str) -> No
     assert any(sentence in text for text in found.problems), found.problems
     assert np.isnan(found.values[0]).all()
     assert found.values[1, 0] == 3.0
+
+
+def test_tables_as_people_write_them(tmp_path: Path) -> None:
+    network = Network(Installation.model_validate(short()))
+    path = tmp_path / "r.csv"
+    path.write_text("name, x_um , y_um\none, 1.5, -2.0\ntwo,3.0\n")
+    found = read_readings(network, path)
+    np.testing.assert_array_equal(found.values[:, :2], [[1.5, -2.0], [3.0, np.nan]])
+    assert not found.problems
+    path.write_text("name,x_um,y_um\none,1,5,-2,0\ntwo,3.0\n")  # 1.5 and -2.0, with commas
+    found = read_readings(network, path)
+    assert np.isnan(found.values[0]).all() and found.values[1, 0] == 3.0
+    assert found.problems == (
+        "the reading of one is left out: it has more values than the header line has columns; "
+        "numbers have a decimal point, not a comma",
+    )
 
 
 def test_two_readings_of_one_rasnik() -> None:
@@ -421,7 +439,8 @@ def test_results_of_images_are_known_by_their_file_or_folder() -> None:
     [
         ("a.json", "{", "cannot be read as json"),
         ("a.json", '{"x_um": 1}', "holds no readings"),
-        ("a.csv", "x_um\n1\n", "the header line needs a column 'name'"),
+        ("a.csv", "x_um\n1\n", "the header line needs a column 'name'$"),
+        ("a.csv", "name;x_um\none;1\n", "separated by commas, not by ';'"),
         ("a.toml", "=", "not valid TOML"),
         ("a.xls", "", "readings are .csv, .json, .jsonl or .toml"),
     ],

@@ -81,9 +81,7 @@ def read_readings(network: Network, path: str | PathLike[str]) -> Readings:
     try:
         text = path.read_text(encoding="utf-8-sig")
         if suffix == ".csv":
-            rows: list[Any] = list(csv.DictReader(text.splitlines()))
-            if rows and not {"name", "file"} & set(rows[0]):
-                raise ValueError(f"{path}: the header line needs a column 'name'")
+            rows: list[Any] = _table(text, path)
         elif suffix == ".jsonl":
             rows = [json.loads(line) for line in text.splitlines() if line.strip()]
         else:
@@ -91,6 +89,17 @@ def read_readings(network: Network, path: str | PathLike[str]) -> Readings:
     except (json.JSONDecodeError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: this cannot be read as {suffix[1:]}: {error}") from None
     return parse_readings(network, rows)
+
+
+def _table(text: str, path: Path) -> list[Any]:
+    """Rows of a CSV table."""
+    lines = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    columns = lines.fieldnames = [one.strip() for one in lines.fieldnames or ()]
+    if columns and not {"name", "file"} & set(columns):
+        other = next((mark for mark in ";\t" if mark in columns[0]), None)
+        hint = "" if other is None else f"; columns are separated by commas, not by {other!r}"
+        raise ValueError(f"{path}: the header line needs a column 'name'{hint}")
+    return list(lines)
 
 
 def _rows(content: Any, path: Path) -> list[Any]:
@@ -168,6 +177,11 @@ def _name(network: Network, row: Mapping[str, Any]) -> str | None:
 
 def _numbers(network: Network, index: int, row: Mapping[str, Any]) -> tuple[Array, Array]:
     """Values and sigmas of a row; raises ValueError with what is wrong with it."""
+    if None in row:  # so csv calls what stands beyond the last column
+        raise ValueError(
+            "it has more values than the header line has columns; numbers have a decimal point, "
+            "not a comma"
+        )
     if row.get("ok") in (False, "false", "False", 0):
         flags = row.get("flags") or row.get("error") or "no position"
         shown = ", ".join(flags) if isinstance(flags, list) else str(flags)
@@ -183,12 +197,12 @@ def _numbers(network: Network, index: int, row: Mapping[str, Any]) -> tuple[Arra
             raise ValueError(f"{key} = {sigma:g} is not positive")
     code = row.get("orientation")
     if code not in (None, "", 0, "0"):
-        here, there = int(network.orientation[index]), int(float(str(code)))
+        here, there = int(network.orientation[index]), _number(row, "orientation")
         if there == 5 - here:  # half a turn apart: the same image
             values[3] += np.pi
         elif there != here:
             raise ValueError(
-                f"it has orientation {there}, but as described it is {here} or {5 - here}; check "
+                f"it has orientation {there:g}, but as described it is {here} or {5 - here}; check "
                 "how mask and sensor are turned"
             )
     return values, sigmas
@@ -199,6 +213,8 @@ def _number(row: Mapping[str, Any], key: str) -> float:
     if given is None or given == "":
         return math.nan
     try:
+        if isinstance(given, bool):
+            raise TypeError
         value = float(given)
     except (TypeError, ValueError):
         raise ValueError(f"{key} = {given!r} is not a number") from None
