@@ -237,3 +237,32 @@ def test_images_added_later_are_taken_up(tmp_path):
         ("a", "image1.png", 0),
         ("a0", "image0.png", 0),
     ]
+
+
+def test_a_removed_folder_is_done_with_other_settings_also_if_a_file_had_changed(source, tmp_path):
+    """A file that was only touched has a line in the journal, but no part."""
+    images, dataset = shutil.copytree(source, tmp_path / "s"), tmp_path / "d"
+    analyse_archive(images, dataset)
+    os.utime(images / "0012" / "image0.png", (NOON_S + 1, NOON_S + 1))
+    analyse_archive(images, dataset)
+    shutil.rmtree(dataset / "instrument=0012")
+    run = analyse_archive(images, dataset, track=False)
+    assert set(run.planner.refused) == {"b c=d"}
+    assert keys(dataset) == EXPECTED
+
+
+def test_a_name_too_long_for_a_folder_is_left_out_and_the_rest_done(tmp_path):
+    for name in ("a", "\u6e2c" * 27, "\u6e2c" * 28):  # 9 bytes each, and 11 before them
+        save_folder(tmp_path / "s" / name, 1)
+    run = analyse_archive(tmp_path / "s", tmp_path / "d")
+    assert [name for name, _, _ in keys(tmp_path / "d")] == ["a", "\u6e2c" * 27]
+    assert "is too long for a folder" in run.planner.refused["\u6e2c" * 28][0]
+
+
+def test_an_instrument_on_another_disk_is_not_done_again(source, dataset, tmp_path):
+    """Its folder was moved, and a link put in its place."""
+    shutil.move(dataset / "instrument=0012", tmp_path / "elsewhere")
+    os.symlink(tmp_path / "elsewhere", dataset / "instrument=0012")
+    run = analyse_archive(source, dataset)
+    assert run.planner.unchanged == len(EXPECTED)
+    assert keys(dataset) == EXPECTED

@@ -128,6 +128,14 @@ def test_links_to_other_folders_are_followed_once(tmp_path: Path, archive: Path)
     assert left_out.counts == {"found elsewhere": 1}
 
 
+def test_a_link_in_a_circle_costs_itself_only(archive: Path) -> None:
+    (archive / "EML2" / "2024-01-02" / "circle.png").symlink_to("circle.png")
+    left_out = LeftOut()
+    assert len(list(find_items([archive], left_out=left_out))) == 12
+    assert left_out.counts == {"found elsewhere": 1}
+    assert not left_out.faults
+
+
 def test_sources_with_similar_names_are_two(tmp_path: Path) -> None:
     write(tmp_path / "run1" / "1.png")
     write(tmp_path / "run10" / "1.png")

@@ -34,6 +34,7 @@ _UNFINISHED = "_unfinished-"
 _PART = re.compile(rf"({_UNFINISHED})?part-[0-9a-f]+\.parquet")
 _FORMAT = "rasnik archive 1"
 _WRITERS = 8
+_LONGEST_NAME = 255  # bytes, of a folder on nearly every disk
 
 
 class DatasetError(ValueError):
@@ -186,11 +187,24 @@ class Dataset:
     def _count(self, line: _Line) -> None:
         new = Totals(line.good, line.failed, line.seconds)
         self.totals[line.instrument] = self.totals.get(line.instrument, Totals()) + new
-        self._instruments[line.instrument] = line.settings
+        if line.parts:  # else no row was made with them
+            self._instruments[line.instrument] = line.settings
 
     def folder_of(self, instrument: str) -> Path:
-        """Where the rows of an instrument are."""
-        return self.path / _folder(instrument)
+        """Where the rows of an instrument are.
+
+        Raises
+        ------
+        DatasetError
+            If its name is too long for a folder.
+        """
+        folder = _folder(instrument)
+        if len(folder) > _LONGEST_NAME:
+            raise DatasetError(
+                f"the name {instrument} is too long for a folder of the dataset, in which letters "
+                "other than ASCII take 6 to 12 places; rename it, or take a part with --pattern"
+            )
+        return self.path / folder
 
     def differences(self, instrument: str, settings: InstrumentSettings, track: bool) -> list[str]:
         """Names of settings that its rows were made with other values of; none without rows."""
@@ -203,7 +217,7 @@ class Dataset:
     def store(self, work: Work, result: Result) -> None:
         """Write the rows of a chunk, then that it is done."""
         chunk = work.chunk
-        folder = self.path / _folder(chunk.instrument)
+        folder = self.folder_of(chunk.instrument)
         with ThreadPoolExecutor(_WRITERS) as pool:  # each waits for the disk
             list(pool.map(lambda part: _write(folder, chunk.name, part), result.parts))
         line = _Line(
@@ -312,7 +326,11 @@ def _lines(journal: Path) -> Iterator[_Line | str]:
 
 def _parts(path: Path) -> Iterator[tuple[str, int]]:
     """(path below the dataset, bytes) of every part there is, unfinished ones too."""
-    for folder, _, names in os.walk(path):
+
+    def refuse(error: OSError) -> None:  # parts that are not seen would be done once more
+        raise error
+
+    for folder, _, names in os.walk(path, onerror=refuse, followlinks=True):
         for name in names:
             file = os.path.join(folder, name)
             if _PART.fullmatch(name):

@@ -154,13 +154,13 @@ class ArchiveRun:
 
     def _settings_of(self, instrument: str) -> InstrumentSettings:
         """Settings, unless the dataset has rows that were made with others."""
-        settings = self.table.of(instrument)
+        settings, folder = self.table.of(instrument), self.dataset.folder_of(instrument)
         differing = self.dataset.differences(instrument, settings, self.track)
         if differing:
             raise DatasetError(
                 f"{self.dataset.path} holds results of {instrument} that were made with another "
                 f"{' and '.join(differing)} than is asked for now; name a new folder, or remove "
-                f"{self.dataset.folder_of(instrument)} to have it analysed anew"
+                f"{folder} to have it analysed anew"
             )
         return settings
 

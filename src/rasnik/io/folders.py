@@ -119,4 +119,8 @@ def _local(entry: os.DirEntry[str]) -> Entry:
         status = entry.stat()
         return status.st_size, status.st_mtime
 
-    return Entry(entry.path, entry.name, entry.is_dir(), entry.is_symlink(), stat)
+    try:
+        is_folder = entry.is_dir()
+    except OSError:  # a link in a circle; `stat` says so
+        is_folder = False
+    return Entry(entry.path, entry.name, is_folder, entry.is_symlink(), stat)
