@@ -26,11 +26,14 @@ def camera_frame(
     k: int, number: int | None = None, image: np.ndarray | None = None, **times: float
 ) -> CameraFrame:
     """Frame k of a regular stream; numbers from 1."""
-    usual = {"host_time_s": 1000 + k * PERIOD_S, "device_time_s": 10 + k * PERIOD_S}
+    usual = {
+        "host_time_s": 1000 + k * PERIOD_S,
+        "device_time_s": 10 + k * PERIOD_S,
+        "received_s": time.perf_counter() + k * PERIOD_S,
+    }
     return CameraFrame(
         image=IMAGES[k % len(IMAGES)] if image is None else image,
         number=k + 1 if number is None else number,
-        received_s=time.perf_counter(),
         **(usual | times),
     )
 

@@ -53,6 +53,7 @@ class FakeChannel:
         """One more frame."""
         k = self.recent.count
         now = time.time() if host_time_s is None else host_time_s
+        received_s = time.perf_counter() if host_time_s is None else host_time_s
         noise = self._rng.normal(size=4) * SIGMAS
         x, y, scale, theta = np.array([4000, 5000, 1, 0.002]) + noise
         x += 0.05 * np.sin(2 * np.pi * k / self.rate_hz)
@@ -61,7 +62,7 @@ class FakeChannel:
             covariance=np.diag(np.square(SIGMAS)), dark_level=20.0, light_level=200.0,
             projection=Projection.from_pose(x, y, scale, theta, 4), method="likelihood",
         )  # fmt: skip
-        frame = CameraFrame(self._image, k + 1, now, time.perf_counter(), now, self._exposure_us)
+        frame = CameraFrame(self._image, k + 1, now, received_s, now, self._exposure_us)
         self._latest = Sample(frame, k, pose)
         self.recent.add(self._latest, now, 0.001)
 

@@ -188,12 +188,19 @@ def test_a_sink_that_fails_is_told_of_and_harms_no_other(tmp_path, channels):
 
 def test_a_camera_that_is_lost_comes_back_by_itself(tmp_path, channels):
     lost = CameraLostError("the cable was pulled.")
-    frames = [camera_frame(k) for k in range(20)]
+    began_s = time.perf_counter()
+    frames = [camera_frame(k, received_s=began_s + k * PERIOD_S) for k in range(20)]
     camera = ScriptedCamera([*frames, lost])
     channel = run(make_channel(tmp_path, camera), channels)
     wait_for(lambda: channel.status().reconnects == 1)
     # It counts anew, and so does its clock.
-    back = [camera_frame(49 + k, k + 1, device_time_s=0.1 + k * PERIOD_S) for k in range(10)]
+    back = [
+        camera_frame(
+            49 + k, k + 1, device_time_s=0.1 + k * PERIOD_S,
+            received_s=began_s + (49 + k) * PERIOD_S,
+        )
+        for k in range(10)
+    ]  # fmt: skip
     camera.show(*back)
     wait_for(lambda: channel.recent.count == 30)
     status = channel.status()

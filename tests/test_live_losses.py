@@ -12,11 +12,12 @@ from rasnik import Flag
 from rasnik.live.losses import Losses
 
 BLANK = np.zeros((1, 1), dtype=np.uint8)
+CLOCKS_S = {"host_time_s": 1000, "device_time_s": 10, "received_s": 5}
 
 
 def frame(k: float, number: int, **times: float):
-    """At k periods of both clocks."""
-    at = {"host_time_s": 1000 + k * PERIOD_S, "device_time_s": 10 + k * PERIOD_S}
+    """At k periods of all clocks."""
+    at = {name: start + k * PERIOD_S for name, start in CLOCKS_S.items()}
     return camera_frame(0, number, BLANK, **(at | times))
 
 
@@ -214,3 +215,18 @@ def test_every_frame_is_accounted_for(rng):
         assert losses.add(frame(at, (number - 1) % 65535 + 1)).number == slot
         slot, number = slot + 1, number + 1
     assert (losses.lost_in_transfer, losses.lost_by_time) == (in_transfer, by_time)
+
+
+@pytest.mark.parametrize("away", [False, True])
+@pytest.mark.parametrize("device", [{}, {"device_time_s": math.nan}])
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0])
+def test_a_time_of_day_that_is_set_loses_no_frame(step_s, device, away):
+    """Also of a camera without a clock, and while it is connected again."""
+    losses = Losses()
+    for k in range(40):
+        after = k >= 20
+        if away and k == 20:
+            losses.restart()
+        set_to = {"host_time_s": 1000 + k * PERIOD_S + step_s * after}
+        assert losses.add(frame(k, k + 1, **set_to, **device)).number == k
+    assert (losses.lost_in_transfer, losses.lost_by_time) == (0, 0)

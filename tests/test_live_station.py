@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from _live_camera import camera_frame
+from _live_camera import PERIOD_S, camera_frame
 from rasnik.analysis.pose import Pose
 from rasnik.live.alarms import AlarmWatch, Condition
 from rasnik.live.recent import RECENT_ROW, Recent
 from rasnik.live.station import Alarms, StationConfig, load_station
 from rasnik.live.station_file import station_toml
 from rasnik.recording.sample import Sample
+from rasnik.web.rows import last_rows
 
 
 def write(path: Path, text: str) -> Path:
@@ -90,7 +91,7 @@ def test_relative_paths_count_from_the_file(tmp_path):
 
 
 def sample(k: int) -> Sample:
-    return Sample(camera_frame(k), k, Pose(x_um=float(k)))
+    return Sample(camera_frame(k, received_s=k * PERIOD_S), k, Pose(x_um=float(k)))
 
 
 def test_the_ring_keeps_the_newest_rows_and_counts_all():
@@ -198,3 +199,16 @@ def test_alarms_of_the_channel_itself(limits, condition, sentence):
     alarms = watch(**limits)
     assert alarms.look(rows(), (0, 0), Condition(time.monotonic())) == ()
     assert alarms.look(rows(), (0, 0), Condition(time.monotonic(), **condition)) == (sentence,)
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0, -0.5])
+def test_a_time_of_day_that_is_set_leaves_the_last_seconds_alone(step_s):
+    """Where a zero is set, rows of before would be averaged; a spectrum would have a wrong rate."""
+    recent = Recent()
+    for k in range(3000):
+        step = step_s * (k >= 2950)
+        frame = camera_frame(k, host_time_s=1000 + k * PERIOD_S + step, received_s=k * PERIOD_S)
+        recent.add(Sample(frame, k, Pose(x_um=float(k))), frame.host_time_s, 0.001)
+    expected = list(range(2899, 3000))
+    assert recent.last(1.005)["frame"].tolist() == expected
+    assert last_rows(recent, 1.005)[0]["frame"].tolist() == expected

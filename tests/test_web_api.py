@@ -380,7 +380,7 @@ def test_no_lattice_without_a_position(station: Any) -> None:
 def test_white_noise_lies_at_the_bound(rng: np.random.Generator) -> None:
     rows = np.zeros(8192, RECENT_ROW)
     rows["frame"] = np.arange(len(rows))
-    rows["host_time_s"] = 1e9 + rows["frame"] / 200
+    rows["received_s"] = 1e9 + rows["frame"] / 200
     for quantity, sigma in zip(QUANTITIES, SIGMAS, strict=True):
         rows[quantity.column] = 3 + sigma * rng.normal(size=len(rows))
         rows[quantity.sigma] = sigma

@@ -1,4 +1,8 @@
-"""Which frames are missing: the camera's numbers and both clocks against each other."""
+"""Which frames are missing: the camera's numbers, and two clocks against each other.
+
+Beside the camera's clock it is the one by which frames are received, which nobody sets. The
+computer's time of day may be set at any moment, and loses no frame by that.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +21,7 @@ _KNOWN_AFTER = 8  # intervals, before frames are missed by time
 _LATE = 0.75  # periods; a frame later than that comes instead of the one that was expected
 _FORGET = 1 / 8  # of the lateness, per frame: clocks drift, and the period is not known well
 _REPAID_WITHIN = 64  # frames, in which frames that were thought lost may still come
-_CLOCK_JUMP_S = 2.0  # by which the camera's clock gains on the host's: it was set
+_CLOCK_JUMP_S = 2.0  # by which the camera's clock gains on the computer's: it was set
 _ODD_GAP = 1000  # frames, beyond twice what fits in the time: the camera began to count anew
 
 
@@ -53,7 +57,7 @@ class Losses:
     regular : bool
         Whether frames are due at regular times. If not, none is missed by time.
     live : bool
-        Whether the host's clock runs with the camera's. It does not for recordings.
+        Whether the computer's clock runs with the camera's. It does not for recordings.
 
     Attributes
     ----------
@@ -73,7 +77,7 @@ class Losses:
         self.period_s = math.nan
         self._number = -1
         self._last: CameraFrame | None = None
-        self._host_time_s = math.nan
+        self._received_s = math.nan
         self._forget_times()
         self._continued = self._pace_changed = False
 
@@ -106,7 +110,7 @@ class Losses:
         self._continued = False
         self.frames += 1
         self._number += passed
-        self._last, self._host_time_s = frame, frame.host_time_s
+        self._last, self._received_s = frame, frame.received_s
         return Arrival(self._number, self._time(frame), flags)
 
     def _forget_times(self) -> None:
@@ -141,14 +145,14 @@ class Losses:
         last = self._last
         if last is None:
             return math.nan
-        elapsed_host_s = frame.host_time_s - last.host_time_s
+        received_s = frame.received_s - last.received_s
         one, other = frame.device_time_s, last.device_time_s
         if not (math.isfinite(one) and math.isfinite(other)):
-            return elapsed_host_s
+            return received_s
         if one == 0 or (other == 0 and self.frames > 1):
-            return elapsed_host_s if self._live else math.nan
+            return received_s if self._live else math.nan
         elapsed_s = one - other
-        if self._live and elapsed_s > elapsed_host_s + _CLOCK_JUMP_S:
+        if self._live and elapsed_s > received_s + _CLOCK_JUMP_S:
             return math.nan
         return elapsed_s
 
@@ -182,8 +186,8 @@ class Losses:
         self._late = max(self._late, -_LATE)
 
     def _missed_while_away(self, frame: CameraFrame) -> int:
-        """By the host's clock: the camera's may have begun anew."""
-        away = (frame.host_time_s - self._host_time_s) / self.period_s
+        """By the computer's clock: the camera's may have begun anew."""
+        away = (frame.received_s - self._received_s) / self.period_s
         missed = max(0, round(away) - 1) if self._regular and math.isfinite(away) else 0
         self.lost_by_time += missed
         return missed

@@ -13,10 +13,11 @@ from rasnik.tracking.track import POSE_COLUMNS, TRACK_COLUMNS
 
 __all__ = ["RECENT_ROW", "Recent"]
 
-#: The columns of a track, and what is only known where the frames come in.
+_ARRIVAL = ("host_time_s", "device_time_s", "received_s", "latency_s", "exposure_us")
+#: The columns of a track, and what is only known where the frames come in. Times between rows
+#: are those of `received_s`: nobody sets that clock.
 RECENT_ROW = np.dtype(
-    [(column.name, column.dtype) for column in TRACK_COLUMNS]
-    + [(name, "f8") for name in ("host_time_s", "device_time_s", "latency_s", "exposure_us")]
+    [(column.name, column.dtype) for column in TRACK_COLUMNS] + [(name, "f8") for name in _ARRIVAL]
 )
 _ROWS = 1 << 16
 
@@ -55,6 +56,7 @@ class Recent:
             int(pose.flags),
             frame.host_time_s,
             frame.device_time_s,
+            frame.received_s,
             latency_s,
             frame.exposure_us,
         )
@@ -92,13 +94,13 @@ class Recent:
             return np.concatenate([self._rows[start:], self._rows[:stop]]), end
 
     def last(self, seconds: float) -> NDArray[Any]:
-        """Rows of the last seconds before the newest, by the host's clock."""
+        """Rows of the last seconds before the newest."""
         size = 1024
         while True:  # the ring is large: no more of it is copied than is needed
             rows, _ = self.since(max(self._count - size, 0))
             if not len(rows):
                 return rows
-            begin_s = rows["host_time_s"][-1] - seconds
-            if rows["host_time_s"][0] < begin_s or len(rows) < size:
-                return rows[rows["host_time_s"] >= begin_s]
+            begin_s = rows["received_s"][-1] - seconds
+            if rows["received_s"][0] < begin_s or len(rows) < size:
+                return rows[rows["received_s"] >= begin_s]
             size *= 4

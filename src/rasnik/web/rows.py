@@ -21,9 +21,9 @@ def last_rows(recent: Any, seconds: float) -> tuple[NDArray[Any], int]:
     rows, following = recent.since(max(0, recent.count - _SAMPLE))
     if len(rows) < 2:
         return rows, following
-    span_s = float(rows["host_time_s"][-1] - rows["host_time_s"][0])
+    span_s = float(rows["received_s"][-1] - rows["received_s"][0])
     if span_s < seconds:
         rate_hz = len(rows) / max(span_s, 1e-3)
         wanted = int(min(_SPARE * rate_hz * seconds + _SAMPLE, np.iinfo(np.int32).max))
         rows, following = recent.since(max(0, following - wanted))
-    return rows[rows["host_time_s"] >= rows["host_time_s"][-1] - seconds], following
+    return rows[rows["received_s"] >= rows["received_s"][-1] - seconds], following

@@ -75,7 +75,7 @@ def _places(rows: NDArray[Any]) -> tuple[NDArray[np.int64], float]:
     places = rows["frame"] - (rows["frame"][0] if len(rows) else 0)
     if len(rows) < _LEAST_ROWS or places[-1] > 4 * len(rows):
         raise ValueError("there are too few frames for a spectrum yet")
-    span_s = float(rows["host_time_s"][-1] - rows["host_time_s"][0])
+    span_s = float(rows["received_s"][-1] - rows["received_s"][0])
     if not span_s > 0:
         raise ValueError("the times of the frames do not increase; there is no spectrum")
     return places, float(places[-1] / span_s)
