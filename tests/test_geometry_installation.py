@@ -207,6 +207,18 @@ FAULTS = {
     "sagitta sagitta: there is no body 'roof'": change(
         "sagittas", to=[{"bodies": ["table", "stage", "roof"]}]
     ),
+    "sagitta sagitta: the points of table and roof are at the same place": lambda data: data.update(
+        bodies=[*data["bodies"], {"name": "roof", "position_mm": [0, 0, 5]}],
+        sagittas=[
+            {"bodies": ["table", "stage", "roof"], "points_mm": [[0, 0, 5], [0, 0, 0], [0, 0, 0]]}
+        ],
+    ),
+    "body table is fixed, and prior.x_um says how far it may move": change(
+        "bodies", 0, "prior", to={"x_um": 5.0}
+    ),
+    "body stage is held in rz, and prior.rz_rad says": lambda data: data["bodies"][1].update(
+        held=["rz"], prior={"rz_rad": 1e-3, "x_um": 5.0}
+    ),
     "the sensor is seen edge on": change(
         "rasniks", 0, "sensor", "rotation_rad", to=[np.pi / 2, 0, 0]
     ),

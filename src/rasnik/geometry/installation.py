@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rasnik._config import ContradictionError, SystemConfigError, read_toml, sentences
-from rasnik.geometry.mounting import mounting_problems
+from rasnik.geometry.mounting import COINCIDENT_MM, mounting_problems, world
 from rasnik.geometry.rigid import DOFS
 
 __all__ = [
@@ -185,7 +185,7 @@ class Installation(_Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        problems = [*self._name_problems(), *self._body_problems()]
+        problems = [*self._name_problems(), *self._prior_problems(), *self._body_problems()]
         bodies = {body.name for body in self.bodies}
         for rasnik in self.rasniks:
             if {rasnik.mask.body, rasnik.lens.body, rasnik.sensor.body} <= bodies:
@@ -201,6 +201,14 @@ class Installation(_Part):
                 if count > 1:
                     yield f"{count} {kind} have the name {name!r}: give each its own"
 
+    def _prior_problems(self) -> Iterator[str]:
+        for body in self.bodies:
+            for dof, free in zip(DOFS, body.free, strict=True):
+                if not free and getattr(body.prior, dof) is not None:
+                    how = "fixed" if body.fixed else f"held in {dof.split('_')[0]}"
+                    yield f"body {body.name} is {how}, and prior.{dof} says how far it may " \
+                        "move: give one of them"  # fmt: skip
+
     def _body_problems(self) -> Iterator[str]:
         names = [body.name for body in self.bodies]
         used = [
@@ -212,11 +220,21 @@ class Installation(_Part):
             used += [(f"sagitta {sagitta.name}", name) for name in sagitta.bodies]
             if len(set(sagitta.bodies)) < 3:
                 yield f"sagitta {sagitta.name} needs three different bodies"
+            elif set(sagitta.bodies) <= set(names) and self._has_no_line(sagitta):
+                yield f"sagitta {sagitta.name}: the points of {sagitta.bodies[0]} and " \
+                    f"{sagitta.bodies[2]} are at the same place and make no line"  # fmt: skip
         for what, name in used:
             if name not in names:
                 near = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
                 hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(names)}"
                 yield f"{what}: there is no body {name!r}; {hint}"
+
+    def _has_no_line(self, sagitta: Sagitta) -> bool:
+        first, _, last = (
+            world(self.body(name), point)
+            for name, point in zip(sagitta.bodies, sagitta.points_mm, strict=True)
+        )
+        return bool(np.linalg.norm(last - first) < COINCIDENT_MM)
 
     def _faults(self, rasnik: Rasnik) -> Iterator[str]:
         accuracy = self.accuracy(rasnik)

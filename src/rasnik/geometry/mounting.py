@@ -17,12 +17,12 @@ if TYPE_CHECKING:
     from rasnik.geometry.installation import Body, Installation, Rasnik
     from rasnik.instrument import System
 
-__all__ = ["Mounting", "mounting", "mounting_problems"]
+__all__ = ["COINCIDENT_MM", "Mounting", "mounting", "mounting_problems", "world"]
 
 Array = NDArray[np.float64]
 
-# Elements nearer to each other than this are taken for the same point.
-_COINCIDENT_MM = 1e-3
+#: Points nearer to each other than this are taken for the same.
+COINCIDENT_MM = 1e-3
 # Body axes nearer to the line than this (cosine) cannot say where X points.
 _ALONG = 0.9
 
@@ -57,21 +57,21 @@ def mounting(installation: Installation, rasnik: Rasnik) -> Mounting:
     """
     bodies = [installation.body(e.body) for e in (rasnik.mask, rasnik.lens, rasnik.sensor)]
     mask_body, lens_body, sensor_body = bodies
-    mask, sensor = _world(mask_body, rasnik.mask.position_mm), _world(
+    mask, sensor = world(mask_body, rasnik.mask.position_mm), world(
         sensor_body, rasnik.sensor.position_mm
     )  # fmt: skip
     line = sensor - mask
-    if np.linalg.norm(line) < _COINCIDENT_MM:
+    if np.linalg.norm(line) < COINCIDENT_MM:
         raise ValueError("mask and sensor are at the same place")
     if rasnik.lens.position_mm is None:
         lens = mask + line / (1 + _wanted_scale(installation, rasnik))
         lens_local = rotation_matrix(lens_body.rotation_rad).T @ (lens - lens_body.position_mm)
     else:
         lens_local = np.array(rasnik.lens.position_mm, dtype=np.float64)
-        lens = _world(lens_body, lens_local)
+        lens = world(lens_body, lens_local)
     along = (lens - mask) @ line / (line @ line)
     for name, place in (("mask", mask), ("sensor", sensor)):
-        if np.linalg.norm(lens - place) < _COINCIDENT_MM:
+        if np.linalg.norm(lens - place) < COINCIDENT_MM:
             raise ValueError(f"lens and {name} are at the same place")
     if not 0 < along < 1:
         raise ValueError(
@@ -91,7 +91,8 @@ def mounting(installation: Installation, rasnik: Rasnik) -> Mounting:
     return Mounting(points, mask_axes, sensor_axes, np.array([mask, lens, sensor]))
 
 
-def _world(body: Body, point_mm: NDArray[np.float64] | list[float]) -> Array:
+def world(body: Body, point_mm: NDArray[np.float64] | list[float]) -> Array:
+    """Where a point of a body stands in the installation, nominal, mm."""
     return np.asarray(body.position_mm + rotation_matrix(body.rotation_rad) @ np.array(point_mm))
 
 
