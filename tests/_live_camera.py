@@ -29,7 +29,7 @@ def camera_frame(
     usual = {
         "host_time_s": 1000 + k * PERIOD_S,
         "device_time_s": 10 + k * PERIOD_S,
-        "received_s": time.perf_counter() + k * PERIOD_S,
+        "received_s": time.perf_counter(),
     }
     return CameraFrame(
         image=IMAGES[k % len(IMAGES)] if image is None else image,
