@@ -136,6 +136,27 @@ def test_reference_makes_origins_of_masks_irrelevant() -> None:
     np.testing.assert_allclose(found.sigmas[0, :2], np.sqrt(2), rtol=1e-3)
 
 
+def test_a_reference_that_contradicts_the_description_is_named() -> None:
+    network = camera(held=["rx", "ry"])  # S = 0.25, theta_z = 0
+    turned = [0.0, 0.0, 0.25, 1.5]
+    (problem,) = adjust(network, readings([[9.0, 0, 0.25, 1.5]]), readings([turned])).problems
+    assert problem.startswith("reference: cam has theta_rad = 1.5, but as described it is 0; say")
+    found = adjust(network, readings([[9.0, 0, 0.5, 0]]), readings([[0, 0, 0.5, 0.05]]))
+    (problem,) = found.problems
+    assert "reference: cam has scale = 0.5, but as described it is 0.25; check" in problem
+    assert not found.complete
+    # half a turn is the same image, small angles and a scale of the lens's middle are mounting
+    fine = readings([[0, 0, 0.26, np.pi - 0.05]])
+    assert not adjust(network, fine, fine).problems
+    # without a reference the fit compares what is measured, and only that
+    text = network.installation.model_dump(exclude_none=True)
+    text["rasniks"][0]["measures"] = ["x", "y"]
+    found = adjust(Network(Installation.model_validate(text)), readings([turned]))
+    assert [one.split(";")[0] for one in found.problems] == [
+        "cam has theta_rad = 1.5, but as described it is 0"
+    ]
+
+
 # ---------------------------------------------------------------------- inversion
 
 

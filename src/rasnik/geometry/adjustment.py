@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rasnik.geometry.installation import VALUES, Installation
 from rasnik.geometry.network import Network
 from rasnik.geometry.observability import LEAKAGE, name_motions, unmeasured_space
-from rasnik.geometry.observations import Readings
+from rasnik.geometry.observations import Readings, contradictions
 from rasnik.geometry.outliers import Snooping, snoop
 from rasnik.geometry.rigid import DOFS, UM_PER_MM
 from rasnik.geometry.sagitta import sagittas
@@ -121,10 +121,13 @@ def _observed(
 
     observed, sigmas = readings.values.copy(), errors(readings)
     problems = list(readings.problems)
-    if reference is not None:
+    if reference is None:
+        problems += contradictions(network, readings, np.isfinite(sigmas))
+    else:
         observed += network.nominal - reference.values
         sigmas = np.hypot(sigmas, errors(reference))
-        problems += [f"reference: {text}" for text in reference.problems]
+        against = contradictions(network, reference, np.zeros_like(sigmas, dtype=bool))
+        problems += [f"reference: {text}" for text in (*reference.problems, *against)]
     nameless = [
         f"{value} of {rasnik.name}"
         for k, rasnik in enumerate(rasniks)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -16,13 +16,16 @@ from numpy.typing import NDArray
 
 from rasnik._config import SystemConfigError, read_toml
 from rasnik.geometry.network import Network
+from rasnik.instrument import scales_contradict
 
-__all__ = ["Readings", "parse_readings", "read_readings", "write_readings"]
+__all__ = ["Readings", "contradictions", "parse_readings", "read_readings", "write_readings"]
 
 Array = NDArray[np.float64]
 
 _VALUES = ("x_um", "y_um", "scale", "theta_rad")
 _SIGMAS = ("sigma_x_um", "sigma_y_um", "sigma_scale", "sigma_theta_rad")
+# As much as distances may be wrong: a tenth of a motion along x then shows along y.
+_TURNED_RAD = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,6 +224,39 @@ def _number(row: Mapping[str, Any], key: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{key} = {given!r} is not a finite number")
     return value
+
+
+def contradictions(
+    network: Network, readings: Readings, compared: NDArray[np.bool_]
+) -> Iterator[str]:
+    """What readings say against the description, where no fit compares them with it.
+
+    Parameters
+    ----------
+    network : Network
+    readings : Readings
+    compared : ndarray of bool, shape (rasniks, 4)
+        Values that a fit compares with those described.
+
+    Yields
+    ------
+    str
+        One sentence for each scale and each theta_z: what x and y mean is then another thing.
+    """
+    seen = np.where(compared, np.nan, readings.values)[:, 2:]
+    for name, (scale, theta), (_, _, here, there) in zip(
+        network.rasniks, seen.tolist(), network.nominal.tolist(), strict=True
+    ):
+        if math.isfinite(scale) and scales_contradict(scale, here):
+            yield (
+                f"{name} has scale = {scale:.4g}, but as described it is {here:.4g}; check the "
+                "positions of mask, lens and sensor"
+            )
+        if math.isfinite(theta) and abs(math.sin(theta - there)) > _TURNED_RAD:
+            yield (
+                f"{name} has theta_rad = {theta:.4g}, but as described it is "
+                f"{round(there, 6) + 0.0:.4g}; say by rotation_rad how its mask or sensor is turned"
+            )
 
 
 def write_readings(network: Network, values: Array, path: str | PathLike[str]) -> None:
