@@ -141,7 +141,7 @@ def test_a_reference_that_contradicts_the_description_is_named() -> None:
     turned = [0.0, 0.0, 0.25, 1.5]
     (problem,) = adjust(network, readings([[9.0, 0, 0.25, 1.5]]), readings([turned])).problems
     assert problem.startswith("reference: cam has theta_rad = 1.5, but as described it is 0; say")
-    found = adjust(network, readings([[9.0, 0, 0.5, 0]]), readings([[0, 0, 0.5, 0.05]]))
+    found = adjust(network, readings([[9.0, 0, 0.5, 0.05]]), readings([[0, 0, 0.5, 0.05]]))
     (problem,) = found.problems
     assert "reference: cam has scale = 0.5, but as described it is 0.25; check" in problem
     assert not found.complete
