@@ -23,6 +23,8 @@ _ORDER = 4
 #: Highest frequency, as a fraction of the rate of the filters: the bilinear rule is off by
 #: (2 pi 0.02)^2 / 12 = 0.13 % there for each derivative.
 _FINE = 0.02
+#: Images of a frequency that are counted on either side; those beyond are below 1e-5 of it.
+_IMAGES = 3
 #: Steps of the forward solution between two samples.
 _STEPS = 16
 
@@ -61,14 +63,31 @@ def inverse_gain(
     quantity: Quantity,
     band_hz: tuple[float, float],
 ) -> NDArray[np.float64]:
-    """What `inverse_in_time` makes of the amplitude of a reading."""
+    """What `inverse_in_time` makes of the amplitude of a reading.
+
+    A spline through the readings has images of each frequency beside the multiples of the rate. The
+    filters let them through in part, and at the readings they count as the frequency itself.
+    """
     from scipy import signal
 
     fine_hz = rate_hz * _steps(rate_hz, band_hz)
-    gain = np.ones(len(frequency_hz))
-    for sections in _filters(fine_hz, suspension, quantity, band_hz):
-        gain = gain * np.abs(signal.sosfreqz(sections, frequency_hz, fs=fine_hz)[1])
-    return gain
+    there, back = _filters(fine_hz, suspension, quantity, band_hz)
+    gain = np.zeros(len(frequency_hz), dtype=complex)
+    for image in range(-_IMAGES, _IMAGES + 1):
+        f_hz = frequency_hz + image * rate_hz
+        forward, backward = (signal.sosfreqz(s, f_hz, fs=fine_hz)[1] for s in (there, back))
+        gain += _of_spline(f_hz / rate_hz) * forward * np.conj(backward)
+    return np.abs(gain)
+
+
+def _of_spline(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Transform of the spline of fifth order through 1 at one place and 0 at all others.
+
+    Source: M. Unser, IEEE Signal Processing Magazine 16 (1999) 22, for cardinal splines.
+    """
+    angle = 2 * np.pi * cycles
+    at_places = (66 + 52 * np.cos(angle) + 2 * np.cos(2 * angle)) / 120
+    return np.asarray(np.sinc(cycles) ** 6 / at_places)
 
 
 def reading_of_ground(
