@@ -268,6 +268,9 @@ def test_times_of_recorded_frames_in_hdf5(tmp_path: Path) -> None:
             file["frames"] = np.ones((2, *SHAPE), np.uint8)
             file[name] = beside
         assert times(path, time_s=7.0) == [(WHEN_S + 0.5, "metadata"), (7.0, "name")]
+    with h5py.File(path, "a") as file:  # seconds of the recording, not of the day
+        file["time_s"][:] = (0.0, 0.5)
+    assert times(path, time_s=7.0) == [(7.0, "name")] * 2
 
 
 # ------------------------------------------------------------------------ reading

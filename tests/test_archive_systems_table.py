@@ -98,6 +98,7 @@ def test_faults_name_file_and_row_and_spare_the_rest(tmp_path: Path) -> None:
         "F,solidras,,,,",
         "F,microras,,,,",
         "G,,,,,",
+        "H,solidras,optics.blur_um=6,,,,5",
         head=ALL,
     )
     table = SystemsTable.read(path, default=load_system("microras"))
@@ -110,9 +111,10 @@ def test_faults_name_file_and_row_and_spare_the_rest(tmp_path: Path) -> None:
         "line 6: instrument is missing",
         "line 9: F is in the table more than once",
         "line 10: system is missing",
+        "line 11: '5' stands beyond the last column; put quotes",
     ):
         assert f"{path}, {said}" in text
-    assert len(table.faults) == 7
+    assert len(table.faults) == 8
     assert table.of("E").system == load_system("solidras")
     with pytest.raises(MissingSystemError, match="the system of B cannot be used"):
         table.of("B")  # the default must not take the place of a row with a fault
@@ -122,6 +124,7 @@ def test_faults_name_file_and_row_and_spare_the_rest(tmp_path: Path) -> None:
     ("content", "sentence"),
     [
         ("instrument,sytem\nA,solidras\n", "the column system is missing.*unknown columns: sytem"),
+        ("instrument,system,system\nA,solidras,microras\n", "columns that are there twice: system"),
         ("instrument,system\n", "the table has no rows"),
         ("", "the column instrument is missing"),
         (b"instrument,system\n\xff\xfe,a\n", "this is not CSV in UTF-8"),

@@ -319,6 +319,24 @@ def test_arrays_that_are_no_images(tmp_path, array, words):
     assert words in error_of(tmp_path / "a.npy")
 
 
+def test_sizes_that_would_fill_the_memory_are_refused_unread(tmp_path):
+    """A few bytes ask for 3.6 GB; what a bit that flipped in a header does."""
+    side = 60_000
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_dataset("frames", (1, side, side), "u1", chunks=(1, 100, 100))
+    with open(tmp_path / "a.npy", "wb") as file:
+        shape = {"descr": "|u1", "fortran_order": False, "shape": (side, side)}
+        np.lib.format.write_array_header_1_0(file, shape)
+        file.truncate(file.tell() + side * side)  # a hole, not on the disk
+    small = np.full((256, 256), 7, np.uint8)
+    tifffile.imwrite(tmp_path / "a.tif", small, compression="zlib", metadata=None)
+    with tifffile.TiffFile(tmp_path / "a.tif", mode="r+") as tif:
+        for name in ("ImageWidth", "ImageLength"):
+            tif.pages[0].tags[name].overwrite(side)
+    for name in ("a.h5", "a.npy", "a.tif"):
+        assert "60000 x 60000 pixels, more than the 256 million" in error_of(tmp_path / name)
+
+
 def test_a_few_nan_pixels_are_noted(tmp_path):
     image = GREY.astype(np.float32)
     image[3, 4] = np.nan

@@ -33,6 +33,7 @@ TABLE_SUFFIXES = (".csv", ".toml", ".parquet")
 Model = Literal["auto", "similarity", "affine", "projective"]
 
 _ROWS = "instruments"
+_BEYOND = "beyond the last column"
 _MAGIC = re.compile(r"[*?\[]")
 
 
@@ -229,6 +230,11 @@ class _Systems:
 
 def _settings(cells: dict[str, Any], systems: _Systems) -> InstrumentSettings:
     """Settings from the cells of a row; raises SystemConfigError."""
+    if _BEYOND in cells:
+        raise SystemConfigError(
+            "",
+            [f"{cells[_BEYOND]!r} stands {_BEYOND}; put quotes around a cell with commas in it"],
+        )
     try:
         row = _Row.model_validate(cells)
     except ValidationError as error:
@@ -264,11 +270,14 @@ def _cells(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
 
 def _check_columns(path: Path, names: Iterable[str]) -> None:
     names, known = list(names), list(_Row.model_fields)
+    twice = sorted({name for name in names if names.count(name) > 1})
     faults = [f"the column {name} is missing" for name in ("instrument", "system")
               if name not in names]  # fmt: skip
     unknown = [name for name in names if name not in known]
     if unknown:
         faults.append(f"unknown columns: {', '.join(unknown)}; known are {', '.join(known)}")
+    elif twice:
+        faults.append(f"columns that are there twice: {', '.join(twice)}; leave one of each")
     if faults:
         raise SystemConfigError(str(path), faults)
 
@@ -279,10 +288,12 @@ def _csv_rows(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
             lines = csv.reader(file)
             names = [name.strip() for name in next(lines, [])]
             _check_columns(path, names)
-            for cells in lines:
-                texts = [cell.strip() for cell in cells]
+            for line in lines:
+                texts = [text.strip() for text in line]
                 if any(texts):
-                    yield f"line {lines.line_num}", _typed(dict(zip(names, texts, strict=False)))
+                    cells = _typed(dict(zip(names, texts, strict=False)))
+                    beyond = ",".join(texts[len(names) :])
+                    yield f"line {lines.line_num}", cells | ({_BEYOND: beyond} if beyond else {})
     except FileNotFoundError:
         raise SystemConfigError(str(path), ["there is no such file"]) from None
     except OSError as error:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rasnik.io.array_choice import choose_images
 from rasnik.io.formats import Stack, frames_of_array
+from rasnik.io.utc import EARLIEST_S
 
 __all__ = ["TIME_NAMES", "open_hdf5", "times_as_function"]
 
@@ -70,7 +71,10 @@ def _times(group: Any) -> NDArray[np.float64] | None:
 def times_as_function(
     times: NDArray[np.float64] | None, count: int
 ) -> Callable[[int], float] | None:
-    """Time of a frame by its index; None where there is not one for each frame."""
+    """Time of a frame by its index; None where there is not one for each frame.
+
+    NaN for times with another zero than 1970, as that of the recording.
+    """
     if times is None or len(times) < count:
         return None
-    return lambda index: float(times[index]) if times[index] > 0 else math.nan
+    return lambda index: float(times[index]) if times[index] >= EARLIEST_S else math.nan

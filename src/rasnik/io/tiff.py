@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from rasnik.io.formats import ImageFileError, Stack, from_channels, open_pillow
+from rasnik.io.formats import ImageFileError, Stack, check_size, from_channels, open_pillow
 
 __all__ = ["open_tiff"]
 
@@ -161,6 +161,7 @@ def open_tiff(path: Path) -> Iterator[Stack]:
         def read(index: int) -> tuple[Image, tuple[str, ...]]:
             source, part = frames[index]
             page = source if part is None else source.pages[0]
+            check_size(page.keyframe.imagelength, page.keyframe.imagewidth)
             try:
                 pixels = page.asarray() if part is None else _contiguous_frame(path, source, part)
             except ValueError as error:
