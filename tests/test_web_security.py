@@ -5,6 +5,7 @@ import http.client
 import os
 import socket
 import struct
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,9 +23,10 @@ from websockets.sync.client import connect  # noqa: E402
 
 from _web_station import fake_station  # noqa: E402
 from rasnik.live.station import Server  # noqa: E402
+from rasnik.web import connections  # noqa: E402
 from rasnik.web.guard import LARGEST_BODY  # noqa: E402
 from rasnik.web.process import page_of  # noqa: E402
-from rasnik.web.server import PageError, read_token  # noqa: E402
+from rasnik.web.server import PageError, PageServer, read_token  # noqa: E402
 
 TOKEN = "0123456789abcdef-top-secret"
 WRITE = {"X-Rasnik": "1"}
@@ -433,3 +435,57 @@ def test_a_client_that_never_reads_costs_no_memory(tmp_path: Path) -> None:
         assert time.monotonic() - start < 8
     finally:
         channel.stop()
+
+
+# ------------------------------------------------------------- what was tried later
+
+
+def test_an_origin_that_is_no_address_is_another_origin(open_url: str) -> None:
+    headers = {"Origin": "http://[", **WRITE}
+    assert httpx.post(f"{open_url}api/channels/top/zero", headers=headers).status_code == 403
+    with pytest.raises(InvalidStatus) as refused:
+        connect(ws(open_url), additional_headers={"Origin": "http://["})
+    assert refused.value.response.status_code == 403
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere 127.0.0.2 is no address")
+def test_every_address_of_this_machine_alone_is_answered(station: Any) -> None:
+    with page_of(station, Server(host="127.0.0.2", port=0)) as server:
+        assert httpx.get(f"{server.url}health").json()["ok"] is True
+        answer = httpx.get(f"{server.url}health", headers={"Host": "evil.example"})
+        assert answer.status_code == 403
+
+
+def test_two_stations_of_one_machine_keep_their_viewers(station: Any, tmp_path: Path) -> None:
+    """A browser sends the cookies of all ports, and keeps one of each name."""
+    names = set()
+    with httpx.Client() as client:
+        for k in range(2):
+            folder = tmp_path / str(k)
+            folder.mkdir()
+            file = token_file(folder, f"{TOKEN}-{k}\n")
+            with page_of(station, Server(port=0, token_file=file)) as server:
+                client.post(server.url + "login", data={"token": f"{TOKEN}-{k}"})
+                assert client.get(server.url + "api/channels").status_code == 200
+            names = set(client.cookies)
+    assert len(names) == 2
+
+
+def test_who_asks_nothing_is_let_go(station: Any, monkeypatch: Any) -> None:
+    """Else 200 silent connections would be all that there are."""
+    monkeypatch.setattr(connections, "PATIENCE_S", 0.2)
+    with PageServer(station, Server(port=0)) as server:
+        parts = urlsplit(server.url)
+        lines = [socket.create_connection((parts.hostname, parts.port)) for _ in range(210)]
+        lines[0].sendall(b"GET /health HTTP/1.1\r\nHost: loc")  # never goes on
+        lines[1].sendall(b"GET /health HTTP/1.1\r\nHost: localhost\r\n\r\nGET /he")
+        with connect(ws(server.url)) as client:
+            for line in lines:
+                line.settimeout(10)
+                while line.recv(65536):
+                    pass
+                line.close()
+            assert httpx.get(server.url + "health").status_code == 200
+            client.send('{"channel": "top"}')  # a websocket stays
+            for _ in range(3):
+                assert client.recv(5)

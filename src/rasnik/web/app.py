@@ -18,7 +18,7 @@ from starlette.staticfiles import StaticFiles
 
 from rasnik.web.api import ENDPOINTS, ApiError, Bytes, Endpoint, answer, body_of
 from rasnik.web.feed import Feeds
-from rasnik.web.guard import COOKIE, Guard, cookie_value, same_token
+from rasnik.web.guard import Guard, cookie_of, same_token
 from rasnik.web.openapi import document
 
 if TYPE_CHECKING:
@@ -96,9 +96,7 @@ def _login(token: str) -> Route:
             await asyncio.sleep(_WRONG_TOKEN_S)
             return HTMLResponse(page.replace("<!-- what is wrong -->", _WRONG_TOKEN), 401)
         response = RedirectResponse("/", 303)
-        response.set_cookie(
-            COOKIE, cookie_value(token), max_age=_COOKIE_S, httponly=True, samesite="strict"
-        )
+        response.set_cookie(*cookie_of(token), max_age=_COOKIE_S, httponly=True, samesite="strict")
         return response
 
     return Route("/login", login, methods=["POST"])

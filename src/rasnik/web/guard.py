@@ -17,17 +17,16 @@ import urllib.parse
 from collections.abc import Awaitable, Callable, Iterator, MutableMapping
 from typing import Any
 
-__all__ = ["COOKIE", "HEADER", "LARGEST_BODY", "Guard", "cookie_value", "same_token"]
+from rasnik.cameras.addresses import is_loopback
 
-#: Of a browser that gave the token.
-COOKIE = "rasnik"
+__all__ = ["HEADER", "LARGEST_BODY", "Guard", "cookie_of", "same_token"]
+
 #: Has to come with every request that changes something; its value does not matter.
 HEADER = "x-rasnik"
 #: Bytes in the body of a request.
 LARGEST_BODY = 16 * 1024
 _BODY_S = 10.0  # time for it to come
 
-_LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
 _OPEN_PATHS = {"/login", "/login.css"}
 _SAFE = {"GET", "HEAD", "OPTIONS"}
 _HEADERS = (
@@ -54,9 +53,16 @@ Send = Callable[[Message], Awaitable[None]]
 App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
-def cookie_value(token: str) -> str:
-    """What a browser keeps instead of the token; it cannot be turned back into it."""
-    return hmac.new(token.encode(), b"rasnik page", hashlib.sha256).hexdigest()
+def cookie_of(token: str) -> tuple[str, str]:
+    """Name and value of what a browser keeps instead of the token, which it does not tell.
+
+    Browsers do not keep the cookies of two ports apart: stations of one machine need other names.
+    """
+    name, value = (
+        hmac.new(token.encode(), about, hashlib.sha256).hexdigest()
+        for about in (b"rasnik station", b"rasnik page")
+    )
+    return f"rasnik-{name[:8]}", value
 
 
 def same_token(given: str, token: str) -> bool:
@@ -84,7 +90,7 @@ class Guard:
     def __init__(self, app: App, token: str | None) -> None:
         self._app = app
         self._token = token
-        self._cookie = cookie_value(token) if token is not None else ""
+        self._cookie = ("", "") if token is None else cookie_of(token)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket":
@@ -144,7 +150,7 @@ class Guard:
         headers = headers_of(scope)
         _check_path(scope)
         if self._token is None:
-            if _name(headers.get("host", "")) not in _LOCAL_NAMES:
+            if not is_loopback(_name(headers.get("host", ""))):
                 raise _RefusedError(
                     403, "This page is served for this machine alone; ask for it as 127.0.0.1."
                 )
@@ -161,9 +167,10 @@ class Guard:
         kind, _, given = headers.get("authorization", "").partition(" ")
         if kind.lower() == "bearer" and same_token(given.strip(), self._token):
             return True
+        name, known = self._cookie
         return any(
-            hmac.compare_digest(value.encode(), self._cookie.encode())
-            for value in _cookies(headers.get("cookie", ""))
+            hmac.compare_digest(value.encode(), known.encode())
+            for value in _cookies(headers.get("cookie", ""), name)
         )
 
     # ----------------------------------------------------------------- changes
@@ -181,7 +188,8 @@ class Guard:
         origin = headers.get("origin")
         if origin is None:
             return
-        if urllib.parse.urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
+        # Compared as text: what is no address is another one, too.
+        if origin.lower().partition("://")[2] != headers.get("host", "").lower():
             raise _RefusedError(403, "A page of another origin may not do this.")
 
 
@@ -201,10 +209,10 @@ def _name(host: str) -> str:
         return ""
 
 
-def _cookies(header: str) -> Iterator[str]:
+def _cookies(header: str, wanted: str) -> Iterator[str]:
     for part in header.split(";"):
         name, _, value = part.strip().partition("=")
-        if name == COOKIE:
+        if name == wanted:
             yield value
 
 

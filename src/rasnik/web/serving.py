@@ -41,6 +41,7 @@ class Serving:
             import uvicorn
 
             from rasnik.web.app import create_app
+            from rasnik.web.connections import Connection
         except ImportError as error:
             raise PageError(
                 f"The page needs {error.name}; install it with: pip install 'rasnik[live]'"
@@ -49,7 +50,7 @@ class Serving:
             uvicorn.Config(
                 create_app(station, token=token),
                 ws="websockets-sansio",
-                http="h11",
+                http=Connection,
                 loop="asyncio",
                 lifespan="off",
                 log_config=None,
