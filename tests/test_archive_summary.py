@@ -214,6 +214,23 @@ def test_one_kind_of_trouble_does_not_hide_the_others() -> None:
     assert [one.instrument for one in chosen if one.kind == "no_mask"][:2] == ["A", "B"]
 
 
+def test_a_mask_with_another_field_is_told_though_every_image_is_good(tmp_path: Path) -> None:
+    """The positions are wrong by the factor of the scale, and neither jump nor scatter."""
+    n = 30
+    flags = [["cold_start", "scale_unexpected"] if k > 11 else [] for k in range(n)]
+    write_rows(tmp_path, "A", np.full(n, 5.0), flags=flags, scale=np.full(n, 0.5))
+    write_rows(tmp_path, "B", np.full(n, 5.0))
+    found = summarise(tmp_path)
+    wrong, right = found.instruments
+    assert wrong.good == n
+    assert wrong.remarks[0].startswith("18 images: The scale differs from the system's")
+    assert not [remark for remark in right.remarks if "scale" in remark]
+    worst = [one for one in found.worst if one.kind == "scale"]
+    assert worst[0].file == "/images/A/12.png" and not worst[0].is_failure
+    assert worst[0].sentence.startswith("the scale is 0.5. The scale differs")
+    assert {one.instrument for one in worst} == {"A"}
+
+
 # ------------------------------------------------------------------------ damage
 
 
@@ -296,7 +313,8 @@ def test_command_writes_a_report_with_pictures(tmp_path: Path, rng: np.random.Ge
 
 
 def test_command_prints_json(tmp_path: Path) -> None:
-    write_rows(tmp_path, "A", np.zeros(5))
+    write_rows(tmp_path, "A[red]", np.zeros(5))
+    assert "A[red]" in run(str(tmp_path)).output
     result = run(str(tmp_path), "--json")
     assert result.exit_code == 0
     document = json.loads(result.output)

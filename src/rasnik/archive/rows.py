@@ -103,6 +103,15 @@ class Rows:
     def __len__(self) -> int:
         return len(self.ok)
 
+    def flagged(self, name: str) -> NDArray[np.int64]:
+        """Indices of the rows that carry a flag."""
+        from pyarrow import compute
+
+        if self.flags is None:
+            return np.empty(0, dtype=np.int64)
+        rows = compute.list_parent_indices(self.flags)
+        return np.asarray(rows.filter(compute.equal(self.flags.flatten(), name)), dtype=np.int64)
+
     def text(self, name: str, index: int) -> Any:
         """A value of one of the other columns; None if there is none."""
         return self.table.column(name)[index].as_py() if name in self.table.schema.names else None

@@ -1,8 +1,8 @@
 """Images of an archive that somebody should look at, each with the reason.
 
 The places are dealt in turn to the kinds of trouble, so that a thousand images of one kind do
-not hide the others: every reason of failure, positions that jump, images that differ from the
-model, and large stated errors.
+not hide the others: every reason of failure, scales that are not the system's, positions that
+jump, images that differ from the model, and large stated errors.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rasnik.analysis.flags import FLAGS, Flag
 from rasnik.archive.rows import Rows
 
 __all__ = ["Suspects", "Worst", "choose"]
@@ -24,6 +25,8 @@ _PLACES = 10
 _EACH = 10  # kept of a kind and an instrument
 _JUMP = 6.0  # times the scatter of a single image
 _TIMES = 1.5  # times the median of the instrument
+_BESIDE_FAILURES = ("scale", "jump", "misfit", "uncertain")
+_SCALE = next(info for info in FLAGS if info.flag is Flag.SCALE_UNEXPECTED)
 #: Error of a mean of neighbours against the image between them: sqrt(1 + 1/2).
 _AGAINST_NEIGHBOURS = math.sqrt(1.5)
 
@@ -37,7 +40,7 @@ class Worst:
     instrument, file : str
     frame : int
     kind : str
-        A reason of failure, ``jump``, ``misfit`` or ``uncertain``.
+        A reason of failure, ``scale``, ``jump``, ``misfit`` or ``uncertain``.
     score : float
         How bad, compared with others of its kind.
     sentence : str
@@ -62,7 +65,7 @@ class Worst:
     @property
     def is_failure(self) -> bool:
         """Whether it has no position."""
-        return self.kind not in ("jump", "misfit", "uncertain")
+        return self.kind not in _BESIDE_FAILURES
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -85,6 +88,10 @@ class Suspects:
             if len(self.by_kind[reason]) < _EACH:
                 text = str(rows.text("error", index) or "no reason is stored")
                 self._keep(rows, index, reason, 1.0, text)
+        for index in rows.flagged(_SCALE.name)[: _EACH - len(self.by_kind["scale"])]:
+            if rows.ok[index]:
+                text = f"the scale is {rows.numbers['scale'][index]:.4g}. {_SCALE.sentence}"
+                self._keep(rows, int(index), "scale", 1.0, text)
         for name in ("x", "y"):
             self._largest(rows, f"jump {name}", _deviation(rows, f"{name}_um"))
         self._largest(rows, "chi2_ndf", np.where(rows.ok, rows.numbers["chi2_ndf"], np.nan))
@@ -174,7 +181,7 @@ def choose(suspects: Iterable[Suspects], places: int = _PLACES) -> list[Worst]:
             piles[kind] += [(k, -image.score, number, image) for k, image in enumerate(images)]
     for pile in piles.values():
         pile.sort(key=lambda entry: entry[:3], reverse=True)  # the first is taken from the end
-    order = [kind for kind, _ in failed.most_common()] + ["jump", "misfit", "uncertain"]
+    order = [kind for kind, _ in failed.most_common()] + [*_BESIDE_FAILURES]
     chosen: dict[tuple[str, int], Worst] = {}
     while len(chosen) < places and any(piles.get(kind) for kind in order):
         for kind in order:

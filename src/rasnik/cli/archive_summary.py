@@ -72,6 +72,7 @@ def _progress() -> Any:
     """Rows and instruments done, on a terminal."""
     from contextlib import contextmanager
 
+    from rich.markup import escape
     from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
     @contextmanager
@@ -86,7 +87,7 @@ def _progress() -> Any:
             def advance(instrument: str, count: int) -> None:
                 nonlocal rows
                 rows += count
-                bar.update(task, description=f"{rows:,} rows, up to {instrument}")
+                bar.update(task, description=escape(f"{rows:,} rows, up to {instrument}"))
 
             yield advance
 
@@ -97,6 +98,7 @@ def _progress() -> Any:
 
 
 def _print(found: Summary) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     from rasnik.report.numbers import with_sigma
@@ -118,7 +120,7 @@ def _print(found: Summary) -> None:
             cells.append("-" if ratio is None else f"{ratio:.2f}")
         drifts = [with_sigma(d.slope, d.sigma) if d.sigma >= 0 else "-" for d in one.drift.values()]
         failed = one.images - one.good
-        table.add_row(one.instrument, f"{one.images:,}", f"{failed:,}", *cells, *drifts)
+        table.add_row(escape(one.instrument), f"{one.images:,}", f"{failed:,}", *cells, *drifts)
     console = output()
     console.print(table)
     more = len(found.instruments) - _MOST_LINES
