@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from rasnik.instrument import load_system
+from rasnik.instrument import System, load_system
 from rasnik.performance.bound import bound
 from rasnik.seismic.budget import BOLTZMANN, SelfNoise, self_noise, thermal_asd
 from rasnik.seismic.ground import readout_asd
@@ -17,6 +17,7 @@ from rasnik.seismic.suspension import Suspension
 
 MASS = Suspension(frequency_hz=0.5, q=100.0, mass_kg=2.0)
 SYSTEM = load_system("microras")
+SLOW = load_system("microras", {"sensor.frame_rate_hz": 25.0, "sensor.exposure_s": 0.04})
 
 
 @pytest.fixture(scope="module")
@@ -103,14 +104,31 @@ def test_bands_reach_the_ends_of_the_budget() -> None:
     assert found.quiet_hz == ((pytest.approx(0.01), pytest.approx(5.0)),)
 
 
+def test_the_mean_over_a_long_exposure_hides_the_ground() -> None:
+    """A sine of the ground at 10 Hz, averaged over 40 ms, is sin(0.4 pi) / (0.4 pi) of itself."""
+    f_hz = np.array([1e-3, 10.0])
+    whole, instant = (
+        self_noise(one, MASS, reading_pm_rthz=5.0, frequency_hz=f_hz)
+        for one in (SLOW, load_system("microras", {"sensor.frame_rate_hz": 25.0}))
+    )
+    lower = math.sin(0.4 * math.pi) / (0.4 * math.pi)
+    found = whole.terms[0].asd / instant.terms[0].asd
+    assert found == pytest.approx([1, 1 / lower], rel=1e-7)
+    np.testing.assert_array_equal(whole.terms[1].asd, instant.terms[1].asd)  # moves the mass
+    assert whole.need(10.0).readout == pytest.approx(whole.terms[0].asd[1])
+    with pytest.raises(ValueError, match=r"exposure of 0.04 s does not fit between frames at 50"):
+        self_noise(SLOW, MASS, reading_pm_rthz=5.0, rate_hz=50.0)
+
+
+@pytest.mark.parametrize("system", [SYSTEM, SLOW], ids=["instant", "exposure"])
 @pytest.mark.parametrize("f_hz", [0.01, 0.1, 3.0, 10.0])
-def test_what_is_needed_is_enough(f_hz: float) -> None:
-    found = self_noise(SYSTEM, MASS, reading_pm_rthz=500.0, temperature_k=3e5)
+def test_what_is_needed_is_enough(f_hz: float, system: System) -> None:
+    found = self_noise(system, MASS, reading_pm_rthz=500.0, temperature_k=3e5)
     need = found.need(f_hz)
     half = math.sqrt(float(noise_model(f_hz)) / 2)
     # More frames, each as good, and a heavier mass:
     better = self_noise(
-        SYSTEM,
+        system,
         MASS.model_copy(update={"mass_kg": 2.0 * need.mass_q}),
         reading_pm_rthz=500.0 / math.sqrt(need.readout_power),
         temperature_k=3e5,
@@ -124,7 +142,7 @@ def test_what_is_needed_is_enough(f_hz: float) -> None:
         for edge in need.natural_hz:
             if edge > 0:
                 tuned = MASS.model_copy(update={"frequency_hz": edge})
-                other = self_noise(SYSTEM, tuned, reading_pm_rthz=500.0)
+                other = self_noise(system, tuned, reading_pm_rthz=500.0)
                 assert other.need(f_hz).readout == pytest.approx(half, rel=1e-6)
 
 
@@ -176,6 +194,8 @@ def test_systems_without_a_rate_and_frequencies_out_of_reach_are_refused(
     slow = load_system("microras", {"sensor.frame_rate_hz": None, "sensor.exposure_s": None})
     with pytest.raises(ValueError, match="frame rate of system microras is not known"):
         self_noise(slow, MASS)
+    hourly = self_noise(slow, MASS, reading_pm_rthz=5.0, rate_hz=1 / 3600)
+    assert hourly.frequency_hz[-1] == pytest.approx(1 / 7200)
     with pytest.raises(ValueError, match="the budget goes from"):
         budget.need(1e-4)
     with pytest.raises(ValueError, match="says nothing at 20 Hz"):

@@ -183,7 +183,10 @@ def _draw_spectrum(
     axes.plot(f_hz, spectrum.asd[inside] * metres, color=colour, linewidth=1, label=name)
     if math.isfinite(sigma):
         f_hz = np.geomspace(*motion.corners_hz[::3], 400)
-        noise = readout_asd(f_hz, sigma * metres, motion.rate_hz, suspension, motion.quantity)
+        noise = readout_asd(
+            f_hz, sigma * metres, motion.rate_hz, suspension, motion.quantity,
+            exposure_s=motion.exposure_s,
+        )  # fmt: skip
         axes.plot(
             f_hz, noise, color=colour, linestyle=_DASHES[0], linewidth=1.2,
             label=f"{name}: noise of the readings",

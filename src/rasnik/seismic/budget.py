@@ -130,6 +130,11 @@ class SelfNoise:
     not_counted: tuple[str, ...]
 
     @property
+    def exposure_s(self) -> float:
+        """Of a frame, whose mean lowers what is seen of the ground; 0 where it is not known."""
+        return self.system.sensor.exposure_s or 0.0
+
+    @property
     def total(self) -> NDArray[np.float64]:
         """Root of the sum of squares of the terms, m/s^2/sqrt(Hz)."""
         return np.sqrt(np.sum([term.asd**2 for term in self.terms], axis=0))
@@ -174,18 +179,23 @@ class SelfNoise:
                 f"{RANGES_HZ[0]:g} to {RANGES_HZ[1]:g} Hz"
             )
         sigma = 1e-12 * self.reading_pm_rthz * math.sqrt(self.rate_hz / 2)
-        readout = float(readout_asd(frequency_hz, sigma, self.rate_hz, self.suspension))
+        readout = float(
+            readout_asd(
+                frequency_hz, sigma, self.rate_hz, self.suspension, exposure_s=self.exposure_s
+            )
+        )
         thermal = math.nan
         if self.suspension.mass_kg is not None:
             thermal = float(thermal_asd(frequency_hz, self.suspension, self.temperature_k))
         place = np.log(self.frequency_hz)
         total = math.exp(np.interp(math.log(frequency_hz), place, np.log(self.total)))
         half = model / math.sqrt(2)
+        seen = float(np.sinc(frequency_hz * self.exposure_s))
         return Need(
             frequency_hz, model, total, readout, thermal,
             max(1.0, (readout / half) ** 2),
             max(1.0, (thermal / half) ** 2) if math.isfinite(thermal) else math.nan,
-            _natural_hz(frequency_hz, half, 1e-12 * self.reading_pm_rthz, self.suspension),
+            _natural_hz(frequency_hz, half, 1e-12 * self.reading_pm_rthz / seen, self.suspension),
         )  # fmt: skip
 
     def as_dict(self, at_hz: tuple[float, ...] = (), *, curves: bool = False) -> dict[str, Any]:
@@ -195,6 +205,7 @@ class SelfNoise:
             "suspension": self.suspension.model_dump(),
             "axis": self.axis,
             "frame_rate_hz": self.rate_hz,
+            "exposure_s": self.system.sensor.exposure_s,
             "temperature_k": self.temperature_k,
             "convention": "one-sided",
             "reading_asd_pm_rthz": self.reading_pm_rthz,
@@ -251,8 +262,8 @@ def self_noise(
         Without `mass_kg` the thermal noise is left out, and the result says so.
     axis : {"x", "y"}
     rate_hz : float, optional
-        Frames in a second, by default the system's. The light of a frame is taken as the
-        system states it.
+        Frames in a second, by default the system's. The light of a frame and its exposure,
+        where known, are taken as the system states them.
     reading_pm_rthz : float, optional
         Noise floor of the readings as measured, one-sided ASD in pm/sqrt(Hz), in place of the
         bound and the rounding.
@@ -268,7 +279,8 @@ def self_noise(
     Raises
     ------
     ValueError
-        If the frame rate is not known, the bound cannot be had, or a value is impossible.
+        If the frame rate is not known, the bound cannot be had, a value is impossible, or the
+        system's exposure is longer than a frame.
     """
     rate = system.sensor.frame_rate_hz if rate_hz is None else rate_hz
     if rate is None:
@@ -279,7 +291,8 @@ def self_noise(
         if not (math.isfinite(value) and value > 0):
             raise ValueError(f"{name} must be above 0, not {value}")
     if frequency_hz is None:
-        frequency_hz = np.geomspace(_LOWEST_HZ, min(rate / 2, _HIGHEST_HZ), _POINTS)
+        highest_hz = min(rate / 2, _HIGHEST_HZ)
+        frequency_hz = np.geomspace(min(_LOWEST_HZ, highest_hz / 10), highest_hz, _POINTS)
     f_hz = np.asarray(frequency_hz, dtype=float)
     if f_hz.ndim != 1 or len(f_hz) < 2 or not (f_hz[0] > 0 and (np.diff(f_hz) > 0).all()):
         raise ValueError("the frequencies must be two or more, above 0 and increasing")
@@ -288,7 +301,8 @@ def self_noise(
 
     def reading(pm_rthz: float) -> NDArray[np.float64]:
         sigma = 1e-12 * pm_rthz * math.sqrt(rate / 2)
-        return readout_asd(f_hz, sigma, rate, suspension)
+        exposure_s = system.sensor.exposure_s or 0.0
+        return readout_asd(f_hz, sigma, rate, suspension, exposure_s=exposure_s)
 
     white = _readout(system, axis, rate, reading_pm_rthz, pose)
     terms = [Term(name, reading(pm), source) for name, pm, source in white]

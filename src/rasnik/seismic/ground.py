@@ -54,6 +54,8 @@ class GroundMotion(Series):
         NaN if that noise is not known.
     stretches, too_short : int
         Stretches that were used, and that are shorter than their two ends.
+    exposure_s : float
+        Of which the mean is undone; 0 if none is.
     """
 
     quantity: Quantity = "displacement"
@@ -64,6 +66,7 @@ class GroundMotion(Series):
     sigma: float = math.nan
     stretches: int = 0
     too_short: int = 0
+    exposure_s: float = 0.0
 
 
 def ground_motion(
@@ -158,7 +161,7 @@ def ground_motion(
         values, series.rate_hz, f"ground {quantity} from {series.name}",
         series.unit + _PER_TIME[quantity], series.start_s, quantity,
         (float(band_hz[0]), float(band_hz[1])), corners, method, edge, noise,
-        stretches, too_short,
+        stretches, too_short, float(exposure_s),
     )  # fmt: skip
 
 
@@ -194,6 +197,8 @@ def readout_asd(
     rate_hz: float,
     suspension: Suspension,
     quantity: Quantity = "acceleration",
+    *,
+    exposure_s: float = 0.0,
 ) -> NDArray[np.float64]:
     """White noise of the readings as ground motion: one-sided ASD, per sqrt(Hz).
 
@@ -204,14 +209,25 @@ def readout_asd(
         Noise of one reading.
     rate_hz : float
         Readings in a second; their ASD is sigma sqrt(2 / rate).
+    suspension : Suspension
+    quantity : {"displacement", "velocity", "acceleration"}
+    exposure_s : float
+        A reading is the mean over it, and shows so much less of the ground.
 
     Returns
     -------
     ndarray, shape of the frequencies
         In the unit of sigma, per s or s^2; infinite where the ground does not move the mass.
+
+    Raises
+    ------
+    ValueError
+        If the exposure is longer than the time between two readings.
     """
+    _check_exposure(exposure_s, rate_hz, "frequency")
+    f_hz = np.asarray(frequency_hz, dtype=float)
     with np.errstate(divide="ignore"):
-        per_reading = 1 / np.abs(suspension.response(frequency_hz, quantity))
+        per_reading = 1 / np.abs(suspension.response(f_hz, quantity) * np.sinc(f_hz * exposure_s))
     return np.asarray(sigma * math.sqrt(2 / rate_hz) * per_reading)
 
 
@@ -228,6 +244,8 @@ def readout_rms(
     """Standard deviation that white noise of the readings gives `ground_motion` in a band."""
     from scipy.integrate import trapezoid
 
+    if not (math.isfinite(sigma) and sigma >= 0):
+        raise ValueError(f"the noise of a reading must be 0 or more, not {sigma}")
     corners = _corners(band_hz, rate_hz, method)
     # In fine steps, whatever the length of a series will be; the inverse has no narrow peaks.
     f_hz = np.geomspace(corners[0] / 8, min(corners[3] * 8, rate_hz / 2), 20_001)
