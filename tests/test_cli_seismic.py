@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -15,7 +16,8 @@ from typer.testing import CliRunner, Result
 from rasnik import Track
 from rasnik.characterisation.gaps import Series, even_series
 from rasnik.cli import app
-from rasnik.io import write_track
+from rasnik.instrument import load_system
+from rasnik.io import read_track, write_track
 from rasnik.report.seismic import budget_figure, ground_figure, ring_down_figure
 from rasnik.seismic.budget import self_noise
 from rasnik.seismic.equation_of_motion import reading_of_ground
@@ -210,18 +212,12 @@ def test_ground_in_other_files(track_file: Path, tmp_path: Path, suffix: str) ->
         found = columns["y_velocity_nm_per_s"]
         assert "method time" in about["y_motion"]
     camera = MASS.model_copy(update={"on_mass": "camera"})
-    from rasnik.io import read_track
-
     series = even_series(read_track(track_file), "y_um")
     wanted = ground_motion(series, camera, "velocity", band_hz=(0.5, 4.0), method="time")
     np.testing.assert_array_equal(found, wanted.values)
 
 
 def test_ground_of_a_track_without_errors_knows_no_noise(track_file: Path, tmp_path: Path) -> None:
-    from dataclasses import replace
-
-    from rasnik.io import read_track
-
     track = read_track(track_file)
     none = np.full(len(track), np.nan)
     path = tmp_path / "bare.h5"
@@ -230,6 +226,27 @@ def test_ground_of_a_track_without_errors_knows_no_noise(track_file: Path, tmp_p
     assert json.loads(rasnik(*options).output)["motions"][0]["sigma_readout"] is None
     given = json.loads(rasnik(*options, "--sigma", "1").output)["motions"][0]
     assert given["sigma_readout"] > 0
+    stored = tmp_path / "ground.h5"
+    assert rasnik(*options, "-o", str(stored)).exit_code == 0
+    with h5py.File(stored) as file:
+        assert "x_motion" in file.attrs and "x_sigma" not in file.attrs
+
+
+def test_the_exposure_of_the_tracks_system_is_named(track_file: Path, tmp_path: Path) -> None:
+    system = load_system("solidras", {"sensor.exposure_s": 0.04, "sensor.frame_rate_hz": RATE_HZ})
+    track = read_track(track_file)
+    path, stored = tmp_path / "track.h5", tmp_path / "ground.h5"
+    write_track(replace(track, metadata={"system_toml": system.to_toml()}), path)
+    options = ("ground", str(path), *MASS_OPTIONS, "--band", "0.5", "5", "-c", "x")
+    run = rasnik(*options, "-o", str(stored))
+    assert "The mean over an exposure of 0.04 s is undone." in run.output
+    with h5py.File(stored) as file:
+        assert "exposure of 0.04 s undone" in file.attrs["x_motion"]
+    assert json.loads(rasnik(*options, "--json").output)["motions"][0]["exposure_s"] == 0.04
+    left_in = rasnik(*options, "--method", "time")
+    assert left_in.exit_code == 0
+    # 1 - sin(0.2 pi) / (0.2 pi)
+    assert "too small by 6.5 % at 5 Hz" in " ".join(left_in.output.split())
 
 
 @pytest.mark.parametrize(
@@ -285,14 +302,37 @@ def test_a_short_decay_is_said_to_be_short(decay_file: Path, tmp_path: Path) -> 
     ("arguments", "sentence"),
     [
         (("-c", "y"), "no free oscillation stands out"),
-        (("--from", "1000"), "too few for a ring-down"),
-        (("--frequency", "40"), "cannot be seen"),
+        (("--from", "1000"), "between --from and --to; it goes from 0 to 119.96 s"),
+        (("--from", "60", "--to", "60.5"), "too few for a ring-down"),
+        (("--from", "nan"), "are times of the track in s"),
+        (("--frequency", "40"), "cannot be seen in these readings, which show 0.0167 to 12.5 Hz"),
     ],
 )
 def test_wrong_ring_downs_are_refused(
     decay_file: Path, arguments: tuple[str, ...], sentence: str
 ) -> None:
     assert sentence in refused("ring-down", str(decay_file), *arguments)
+
+
+def test_times_from_1970_are_not_mistaken_for_those_of_the_track(
+    decay_file: Path, tmp_path: Path
+) -> None:
+    track = read_track(decay_file)
+    path = tmp_path / "live.h5"
+    write_track(replace(track, time_s=1_790_000_000 + track.time_s), path)
+    said = refused("ring-down", str(path), "--from", "10")
+    assert "count from 1970" in said and "from 1790000000 to 1790000119.96 s" in said
+    assert rasnik("ring-down", str(path), "--from", "1790000010").exit_code == 0
+
+
+@pytest.mark.parametrize("command", [("ground", *MASS_OPTIONS, "--band", "1", "5"), ("ring-down",)])
+@pytest.mark.parametrize("frames", [0, 1])
+def test_a_track_without_frames_shows_no_motion(
+    tmp_path: Path, command: tuple[str, ...], frames: int
+) -> None:
+    path = tmp_path / "track.csv"
+    write_track(track_of(np.zeros(frames), np.zeros(frames)), path)
+    assert f"two frames at least; the track has {frames}." in refused(*command, str(path))
 
 
 # ------------------------------------------------------------------------ figures

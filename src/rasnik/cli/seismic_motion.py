@@ -122,9 +122,9 @@ def ground_command(
     from rasnik.characterisation.gaps import even_series
     from rasnik.seismic.ground import ground_motion
 
-    track = read_stored(track_file)
+    track = _track(track_file)
     if exposure_s is None:
-        exposure_s = 0.0 if method is _Method.time else exposure_of(track_file, track)
+        exposure_s = _exposure_s(track_file, track, method, band[1])
     motions: dict[str, GroundMotion] = {}
     sigmas = {name: _sigma_nm(track, name, sigma_nm) for name in names}
     for name in names:
@@ -160,6 +160,29 @@ def ground_command(
             lambda: draw_ground(motions, suspension, plot, sigmas=sigmas, title=track_file.name),
             quiet=as_json,
         )
+
+
+def _track(path: Path) -> Track:
+    """A track that has frames, or the end of the command."""
+    track = read_stored(path)
+    if len(track) < 2:
+        fail(f"{path}: a motion takes two frames at least; the track has {len(track)}.")
+    return track
+
+
+def _exposure_s(path: Path, track: Track, method: _Method, highest_hz: float) -> float:
+    """Of which the mean is undone: as the track's system states it, where the method can."""
+    import numpy as np
+
+    stated_s = exposure_of(path, track)
+    if not stated_s or method is _Method.frequency:
+        return stated_s
+    messages().print(
+        f"--method time leaves the mean over the exposure of {stated_s:g} s in: the motion is too "
+        f"small by {100 * (1 - np.sinc(highest_hz * stated_s)):.2g} % at {highest_hz:g} Hz.",
+        style="yellow",
+    )
+    return 0.0
 
 
 def _axes(text: str) -> list[str]:
@@ -202,6 +225,7 @@ def _ground_dict(
                 "band_hz": list(one.band_hz),
                 "corners_hz": list(one.corners_hz),
                 "method": one.method,
+                "exposure_s": one.exposure_s,
                 "rate_hz": one.rate_hz,
                 "rms": _rms(one),
                 "sigma_readout": one.sigma if math.isfinite(one.sigma) else None,
@@ -240,6 +264,8 @@ def _print_ground(motions: dict[str, GroundMotion]) -> None:
         f"{one.edge_s:.4g} s are cut off at each end of a stretch without gaps: {one.stretches} "
         f"used{short}. Outside the band the motion falls to nothing within an octave."
     )
+    if one.exposure_s:
+        console.print(f"The mean over an exposure of {one.exposure_s:g} s is undone.")
 
 
 # ------------------------------------------------------------------------ ring-down
@@ -255,7 +281,10 @@ def ring_down_command(
         ),
     ] = None,
     start_s: Annotated[
-        float | None, typer.Option("--from", metavar="S", help="Begin of the free decay.")
+        float | None,
+        typer.Option(
+            "--from", metavar="S", help="Begin of the free decay, as the track counts time."
+        ),
     ] = None,
     stop_s: Annotated[float | None, typer.Option("--to", metavar="S", help="Its end.")] = None,
     rate_hz: RateOption = None,
@@ -275,7 +304,7 @@ def ring_down_command(
     from rasnik.characterisation.gaps import even_series
     from rasnik.seismic.ring_down import ring_down
 
-    track = read_stored(track_file)
+    track = _track(track_file)
     sigma = _sigma_nm(track, column.value, sigma_nm)
     try:
         series = even_series(track, _COLUMNS[column.value], rate_hz=rate_hz)
@@ -297,17 +326,34 @@ def ring_down_command(
 
 
 def _between(series: Series, start_s: float | None, stop_s: float | None) -> Series:
-    """The part of a series between two times."""
+    """The part of a series between two times.
+
+    Raises
+    ------
+    ValueError
+        If nothing lies between them, or they do not count from where the times of the track do.
+    """
     from rasnik.characterisation.gaps import Series
+    from rasnik.io.utc import EARLIEST_S
+
+    stop = series.start_s + (len(series) - 1) / series.rate_hz
+    whole = f"it goes from {round(series.start_s, 6):.13g} to {round(stop, 6):.13g} s"
+    given = [time_s for time_s in (start_s, stop_s) if time_s is not None]
+    if not all(math.isfinite(time_s) for time_s in given):
+        raise ValueError(f"--from and --to are times of the track in s; {whole}")
+    if series.start_s >= EARLIEST_S and any(time_s < EARLIEST_S for time_s in given):
+        raise ValueError(f"the times of the track count from 1970, so do --from and --to; {whole}")
 
     def place(time_s: float | None, default: int) -> int:
         if time_s is None:
             return default
         return min(max(math.ceil((time_s - series.start_s) * series.rate_hz), 0), len(series))
 
-    first, stop = place(start_s, 0), place(stop_s, len(series))
+    first, end = place(start_s, 0), place(stop_s, len(series))
+    if not first < end:
+        raise ValueError(f"nothing of the track lies between --from and --to; {whole}")
     return Series(
-        series.values[first:stop], series.rate_hz, series.name, series.unit,
+        series.values[first:end], series.rate_hz, series.name, series.unit,
         series.start_s + first / series.rate_hz,
     )  # fmt: skip
 

@@ -7,6 +7,7 @@ not known is NaN. For miniSEED see `rasnik.io.seismic_files`.
 from __future__ import annotations
 
 import csv
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -74,7 +75,12 @@ def write_ground(
             f"{motion.name}; complete from {low:g} to {high:g} Hz, method {motion.method}, "
             f"{motion.edge_s:g} s missing at each end of a stretch"
         )
-        about[f"{name}_sigma"] = f"{motion.sigma:.6g} {motion.unit} by the noise of the readings"
+        if motion.exposure_s:
+            about[f"{name}_motion"] += f", mean over an exposure of {motion.exposure_s:g} s undone"
+        if math.isfinite(motion.sigma):
+            about[f"{name}_sigma"] = (
+                f"{motion.sigma:.6g} {motion.unit} by the noise of the readings"
+            )
     unfinished = path.with_name(f"{path.stem}.partial{path.suffix}")
     try:
         if suffix == ".csv":

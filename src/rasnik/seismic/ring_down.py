@@ -281,7 +281,10 @@ def _peak_hz(series: Series, fit: _Decay, about_hz: float | None) -> float:
     if about_hz is not None:
         inside &= np.abs(f_hz - about_hz) <= max(_REACH * about_hz, 2 / fit.span_s)
     if not inside.any():
-        raise ValueError(f"an oscillation of {about_hz} Hz cannot be seen in these readings")
+        raise ValueError(
+            f"an oscillation of {about_hz:g} Hz cannot be seen in these readings, which show "
+            f"{_LEAST_PERIODS / fit.span_s:.3g} to {series.rate_hz / 2:.5g} Hz"
+        )
     return float(f_hz[inside][np.argmax(power[inside])])
 
 
