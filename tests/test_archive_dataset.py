@@ -1,5 +1,6 @@
 """A dataset holds each image once, wherever the writing of it is cut off."""
 
+import errno
 import json
 import os
 import shutil
@@ -112,6 +113,27 @@ def test_killed_at_every_step_of_writing(source, tmp_path, monkeypatch):
             break
         steps += 1
     assert steps > 12
+
+
+def test_a_full_disk_is_told_and_what_is_stored_stays(source, tmp_path, monkeypatch):
+    """At each write, the last byte of which does not get there."""
+    fsync = os.fsync
+    for steps in range(4):  # of the first chunk: two parts, settings, its line
+        path, left = tmp_path / f"dataset{steps}", [steps]
+
+        def full(descriptor, left=left):
+            fsync(descriptor)
+            if left[0] == 0:
+                os.ftruncate(descriptor, os.fstat(descriptor).st_size - 1)
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            left[0] -= 1
+
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", full)
+            with pytest.raises(DatasetError, match="cannot be written .No space left on device"):
+                analyse_archive(source, path)
+        analyse_archive(source, path)
+        assert keys(path) == EXPECTED, f"after {steps} steps"
 
 
 def test_a_journal_cut_off_anywhere(source, dataset, finished):

@@ -14,6 +14,7 @@ import os
 import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from hashlib import blake2b
 from pathlib import Path
@@ -161,7 +162,8 @@ class Dataset:
 
     def close(self) -> None:
         """Let others write it."""
-        self._journal.close()
+        with suppress(OSError):  # of a line that did not fit on the disk, which was told then
+            self._journal.close()
         self._lock.release()
 
     def _read(self, journal: Path) -> None:
@@ -215,7 +217,22 @@ class Dataset:
         return [key for key in now if before.get(key) != now[key]]
 
     def store(self, work: Work, result: Result) -> None:
-        """Write the rows of a chunk, then that it is done."""
+        """Write the rows of a chunk, then that it is done.
+
+        Raises
+        ------
+        DatasetError
+            If the disk does not take them; what was stored before is not harmed.
+        """
+        try:
+            self._store(work, result)
+        except OSError as error:
+            raise DatasetError(
+                f"{self.path} cannot be written ({error.strerror or error}); once it can, the same "
+                "command goes on"
+            ) from error
+
+    def _store(self, work: Work, result: Result) -> None:
         chunk = work.chunk
         folder = self.folder_of(chunk.instrument)
         with ThreadPoolExecutor(_WRITERS) as pool:  # each waits for the disk
@@ -327,8 +344,8 @@ def _lines(journal: Path) -> Iterator[_Line | str]:
 def _parts(path: Path) -> Iterator[tuple[str, int]]:
     """(path below the dataset, bytes) of every part there is, unfinished ones too."""
 
-    def refuse(error: OSError) -> None:  # parts that are not seen would be done once more
-        raise error
+    def refuse(error: OSError) -> None:
+        raise error  # parts that are not seen would be done once more
 
     for folder, _, names in os.walk(path, onerror=refuse, followlinks=True):
         for name in names:
