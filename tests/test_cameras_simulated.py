@@ -193,16 +193,22 @@ def test_numbers_wrap_and_truth_knows() -> None:
 
 def test_frames_come_at_the_frame_rate() -> None:
     camera = SimulatedCamera(SMALL)  # 275 Hz
+    begun_s = time.perf_counter()
     camera.open()
     frames = read(camera, 200)
     camera.close()
-    assert [frame.number for frame in frames] == list(range(1, 201))
-    assert (frames[-1].received_s - frames[0].received_s) * 275 == pytest.approx(199, abs=10)
-    assert np.diff([f.device_time_s for f in frames]) == pytest.approx(1 / 275)
-    late_s = [(f.received_s - f.device_time_s) for f in frames]
-    assert min(late_s) >= late_s[0] - 0.05 and np.median(late_s) - min(late_s) < 0.02
-    assert abs(frames[0].host_time_s - time.time()) < 10
-    assert frames[0].device_time_s > 0
+    numbers = np.array([frame.number for frame in frames])
+    device_s = np.array([frame.device_time_s for frame in frames])
+    received_s = np.array([frame.received_s for frame in frames])
+    assert numbers[0] == 1
+    np.testing.assert_allclose(device_s - device_s[0], (numbers - 1) / 275)
+    # A computer that stands still for longer than the buffers last loses frames.
+    assert numbers[-1] - 200 == camera.counters()["underruns"]
+    # No frame comes before it is due, and the usual one comes then.
+    late_s = received_s - begun_s - (device_s - device_s[0])
+    assert late_s.min() >= 0 and np.median(late_s) - late_s.min() < 0.02
+    assert abs(frames[0].host_time_s - time.time()) < 60
+    assert device_s[0] > 0
 
 
 def test_a_frame_is_made_in_a_third_of_its_time(moving: MovingImage) -> None:
