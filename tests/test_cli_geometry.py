@@ -83,6 +83,17 @@ def test_a_reading_of_x_and_y_alone() -> None:
     assert "±" in text
 
 
+def test_motions_that_do_not_explain_a_reading_are_not_its_explanation() -> None:
+    asked = [*SMALL, "--find", "lens_x,lens_y", "--reading"]
+    result = RUNNER.invoke(app, ["geometry", *asked, "1,2,1.5"])  # the scale has changed by half
+    assert result.exit_code == 1
+    assert "do not explain the reading" in result.output and "exactly" not in result.output
+    text = run(*asked, "1,2,1")
+    assert "fitted best by" in text and "1 degree of freedom, probability 1" in text
+    document = json.loads(run(*asked, "1,2,1", "--json"))["displacement"]
+    assert document["probability"] == pytest.approx(1) and document["ndf"] == 1
+
+
 def test_air() -> None:
     found = json.loads(run("--mask-lens-mm", "2000", "--lens-sensor-mm", "3000", "--json"))["air"]
     assert found["shift_um"] == pytest.approx(found["index_per_k"] * 2000 * 5000 / 2)
@@ -104,8 +115,24 @@ def test_the_drawing(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ((), "give --mask-lens-mm or --lens-sensor-mm"),
-        (("microras",), "system microras does not state its distances"),
+        ((), "Give --mask-lens-mm and --lens-sensor-mm, or a system."),
+        (("--mask-lens-mm", "60"), "Give --mask-lens-mm and --lens-sensor-mm, or a system."),
+        (("microras",), "does not state its distances: give --mask-lens-mm or --lens-sensor-mm."),
+        ((*SMALL, "--kelvin-per-m", "nan"), "--kelvin-per-m = nan is not a finite number"),
+        ((*SMALL, "-o", "x.gif"), "the name must end in .png, .pdf, .svg"),
+        (
+            (
+                "--mask-lens-mm",
+                "6",
+                "--lens-sensor-mm",
+                "9",
+                "--find",
+                "lens_x",
+                "--reading",
+                "1,2",
+            ),
+            "--reading has 2 numbers, --find asks for 1: their errors have to weigh them",
+        ),
         (("--mask-lens-mm", "-5", "--lens-sensor-mm", "5"), "--mask-lens-mm = -5 must be positive"),
         (("--set", "sensor.binning=2"), "name the system"),
         (("solidras", "--set", "geometry.mask_lens_mm=30.0"), "make a scale of 2"),

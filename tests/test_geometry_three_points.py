@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from rasnik.geometry.dependence import dependent, indistinguishable
 from rasnik.geometry.inverse import displacement, displacements
@@ -88,6 +89,17 @@ def test_built_as_described(orientation) -> None:
     # whatever the orientation: what x, y and z do is a matter of the mask's own axes
     for motion in ("mask_x", "lens_y", "camera_z", "sensor_z"):
         assert bench.matrix([motion]) == pytest.approx(BENCH.matrix([motion]), rel=1e-12)
+
+
+@pytest.mark.parametrize(("orientation", "sign"), [(1, 1), (2, -1), (3, -1), (4, 1)])
+def test_a_mask_seen_from_behind_turns_the_other_way(orientation, sign) -> None:
+    """Right-handed about X, Y and X x Y; the light goes against X x Y where codes are mirrored."""
+    bench = ThreePoints(A_MM, B_MM, 0.3, orientation)
+    for motion, row, size in (
+        ("mask_turn_z", 3, 1), ("sensor_turn_z", 3, -1), ("camera_turn_z", 3, -1),
+        ("camera_turn_x", 1, A), ("camera_turn_y", 0, -A),
+    ):  # fmt: skip
+        assert bench.matrix([motion])[row, 0] == pytest.approx(sign * size, rel=1e-12)
 
 
 def test_a_camera_turned_about_the_mask_reads_the_same_place() -> None:
@@ -245,6 +257,8 @@ def test_fewer_motions_than_readings_are_weighed_and_judged_by_chi_square(rng) -
     assert np.mean(chi2) == pytest.approx(2, abs=4.5 * math.sqrt(2 * 2 / 100))
     moved = Noisy(values[0], values[1] + 30.0, *values[2:])  # 100 sigma along y, not of these
     assert displacement(BENCH, moved, names).chi2 > 5000
+    chances = [displacement(BENCH, Noisy(*one), names).probability for one in noisy[:400]]
+    assert stats.kstest(chances, "uniform").pvalue > 1e-3
 
 
 def test_sagitta_of_the_lens(rng) -> None:
@@ -292,7 +306,7 @@ def test_from_distances_scale_or_system() -> None:
         ({"mask_lens_mm": 60, "lens_sensor_mm": 90, "scale": 2}, "make a scale of 1.5; give two"),
         ({"mask_lens_mm": -60, "lens_sensor_mm": 90}, "mask_lens_mm = -60 must be positive"),
         ({"mask_lens_mm": 60, "lens_sensor_mm": math.nan}, "lens_sensor_mm = nan must be"),
-        ({"mask_lens_mm": 60}, "give mask_lens_mm or lens_sensor_mm, and the other"),
+        ({"mask_lens_mm": 60}, "give two of mask_lens_mm, lens_sensor_mm and scale"),
         ({"system": load_system("microras")}, "system microras does not state its distances"),
         ({"mask_lens_mm": 60, "scale": 1, "orientation": 5}, "orientation must be 1, 2, 3 or 4"),
         ({"mask_lens_mm": 60, "scale": 1, "x_um": math.inf}, "finite"),
@@ -343,6 +357,7 @@ def test_result_as_a_dictionary() -> None:
     found = displacement(BENCH, BENCH.read({"lens_x": 5.0}), ("lens_x",), use=("x_um",))
     assert found["lens_x"] == pytest.approx(5, rel=1e-9)
     assert found.as_dict()["sigma_lens_x_um"] is None and found.ndf == 0
+    assert found.as_dict()["probability"] is None
     found = displacement(BENCH, Noisy(10, 0, 1.5, 0), COMPLETE[1])
     assert found.as_dict()["sigma_lens_x_um"] == pytest.approx(0.4 / (1 + A / B), rel=1e-5)
     assert motion_index("mask_x") == 0

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rasnik.cli.common import fail, load, numbers, output
-from rasnik.cli.files import PlotOption, written
+from rasnik.cli.files import PlotOption, check_outputs, written
 from rasnik.cli.predict import SetOption
 
 if TYPE_CHECKING:
@@ -79,7 +79,8 @@ def geometry_command(
     """Say what each motion of mask, lens and sensor does to a reading, and invert a reading.
 
     Distances are those of the system, or given. The smallest motion that one image shows follows
-    from the bound of rasnik predict, if the system states its noise.
+    from the bound of rasnik predict, if the system states its noise. Exit status 1: the motions
+    asked for do not explain the reading.
 
     [bold]Examples[/]
 
@@ -89,9 +90,14 @@ def geometry_command(
 
     rasnik geometry solidras --reference 4000,5000 --reading 4012.5,4998,1.0002,0.0001
     """
+    check_outputs([plot] if plot else None, (".png", ".pdf", ".svg"))
     system = load(system_name, overrides or ()) if system_name is not None else None
     if system is None and overrides:
         fail("--set changes a value of a system: name the system.")
+    if system is None and None in (mask_lens_mm, lens_sensor_mm):
+        fail("Give --mask-lens-mm and --lens-sensor-mm, or a system.")
+    if not math.isfinite(kelvin_per_m):
+        fail(f"--kelvin-per-m = {kelvin_per_m:g} is not a finite number.")
 
     from rasnik.geometry.air import Air
     from rasnik.geometry.three_points import three_points
@@ -102,33 +108,36 @@ def geometry_command(
     except ValueError as error:
         fail(_with_options(str(error)))
     wavelength = system.optics.wavelength_nm if system is not None else None
+    no_air = ""
     try:
         air = Air(celsius + 273.15, pressure_hpa, humidity, wavelength or 550.0)
     except ValueError as error:  # the rest does not need the air
-        air, no_air = None, f"{error}"
-    else:
-        no_air = ""
+        air, no_air = None, f"{error}".removeprefix("air: ")
     covariance = _bound_covariance(system)
-    given = None if reading is None else _given(instrument, reading)
-    try:
-        found = None if given is None else _invert(instrument, given, find, covariance)
-    except (ValueError, KeyError) as error:
-        fail(f"{error.args[0]}.")
+    found, given = None, None if reading is None else _given(instrument, reading)
+    if given is not None:
+        try:
+            found = _invert(instrument, given, find, covariance)
+        except (ValueError, KeyError) as error:
+            fail(f"{error.args[0]}.")
+        at = given[0]
+        sagitta = instrument.sagitta(at.x_um, at.y_um, at.scale, covariance)
     if as_json:
         document = _document(instrument, system, covariance, air, no_air, kelvin_per_m)
-        if found is not None and given is not None:
-            document["displacement"] = found.as_dict()
-            document["sagitta_um"] = _sagitta(instrument, given, covariance)[0].tolist()
+        if found is not None:
+            document |= {"displacement": found.as_dict(), "sagitta_um": sagitta[0].tolist()}
         typer.echo(json.dumps(document, indent=2))
     else:
         _print(instrument, system, covariance)
-        if found is not None and given is not None:
-            _print_inverse(found, *_sagitta(instrument, given, covariance))
+        if found is not None:
+            _print_inverse(found, *sagitta)
         _print_air(instrument, air, no_air, kelvin_per_m, wavelength is None)
     if plot is not None:
         from rasnik.report.geometry import draw_geometry
 
         written(plot, lambda: draw_geometry(instrument, plot), quiet=as_json)
+    if found is not None and not _explains(found):
+        raise typer.Exit(1)
 
 
 def _as_built(reference: str | None, pivot_mm: float | None) -> dict[str, Any]:
@@ -182,6 +191,11 @@ def _invert(
     names = [name.strip() for name in find.split(",")]
     if find == _DEFAULT_FIND:
         names = names[:count]
+    if covariance is None and count > len(names):
+        raise ValueError(
+            f"--reading has {count} numbers, --find asks for {len(names)}: their errors have to "
+            "weigh them; name a system that states its noise, or give as many of each"
+        )
     return displacement(instrument, reading, names, covariance, READINGS[:count])
 
 
@@ -221,7 +235,8 @@ def _print(
         )
     )
     console.print(
-        "Axes: x and y of the mask, z along the light. To first order, 1 µm or 1 µrad of:\n"
+        "Axes: x and y of the mask, z along the light; turns are right-handed about X, Y and X × Y "
+        "of the mask. To first order, 1 µm or 1 µrad of:\n"
     )
     table = Table(box=None, pad_edge=False, header_style="bold")
     headings = ["motion", *(f"{one} ({unit})" for one, _, unit in _SHOWN)]
@@ -261,14 +276,6 @@ def _motion_text(value: float | None, name: str) -> str:
     return f"{value:.3g} µm" if value >= 0.1 else f"{1e3 * value:.3g} nm"
 
 
-def _sagitta(
-    instrument: ThreePoints, given: tuple[Reading, int], covariance: NDArray[np.float64] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The lens's distance from the line mask - sensor, and its errors."""
-    reading, _ = given
-    return instrument.sagitta(reading.x_um, reading.y_um, reading.scale, covariance)
-
-
 def _print_inverse(
     found: Displacement, sagitta: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> None:
@@ -277,45 +284,58 @@ def _print_inverse(
 
     console = output()
     known = math.isfinite(covariance[0, 0])
-    console.print(
-        "\nThe reading is explained, exactly and if nothing else has moved, by"
-        + (" (errors: the bound for one image)" if known else "")
-    )
+    fitted = "fitted best by" if found.ndf else "explained exactly by"
+    errors = " (errors: the bound for one image)" if known else ""
+    console.print(f"\nIf nothing else has moved, the reading is {fitted}{errors}")
     for name in found.names:
         factor, unit = (1e6, "µrad") if motion_unit(name) == "rad" else (1.0, "µm")
         console.print(
             f"  {name:14s} {with_sigma(factor * found[name], factor * found.sigma(name))} {unit}"
         )
-    if math.isfinite(found.chi2):
-        console.print(f"  chi-square {found.chi2:.4g} for {found.ndf} degrees of freedom")
+    if found.ndf:
+        plural = "s" if found.ndf > 1 else ""
+        console.print(
+            f"  chi-square {found.chi2:.4g} for {found.ndf} degree{plural} of freedom, probability "
+            f"{found.probability:.3g}"
+        )
+    if not _explains(found):
+        console.print(
+            "These motions do not explain the reading: something else has moved, or the errors are "
+            "larger than the bound.",
+            style="red",
+        )
     x, y = (with_sigma(sagitta[k], math.sqrt(covariance[k, k])) for k in (0, 1))
     console.print(f"Sagitta of the lens on the line from mask to sensor: x {x} µm, y {y} µm")
+
+
+def _explains(found: Displacement) -> bool:
+    """Whether the motions that were asked for may be all there is."""
+    from rasnik.geometry.solution import LEAST_PROBABILITY
+
+    return not found.probability < LEAST_PROBABILITY
 
 
 def _print_air(
     instrument: ThreePoints, air: Air | None, no_air: str, kelvin_per_m: float, assumed: bool
 ) -> None:
-    from rasnik.geometry.refraction import bending_um, equivalent_motions_um, index_gradient
-
     console = output()
     if air is None:
         console.print(f"\nNothing is said of the air: {no_air}")
         return
-    shift = float(bending_um(instrument, index_gradient(air, kelvin_per_m)))
+    found = _air_document(instrument, air, kelvin_per_m)
     console.print(
         f"\nAir at {air.temperature_k - 273.15:g} °C, {air.pressure_hpa:g} hPa, "
         f"{100 * air.humidity:g} % humidity, {air.wavelength_nm:g} nm"
-        f"{' (assumed)' if assumed else ''}: n - 1 = {air.refractivity:.6g}, "
-        f"dn/dT = {air.slopes.per_k:.4g} /K"
+        f"{' (assumed)' if assumed else ''}: n - 1 = {found['refractivity']:.6g}, "
+        f"dn/dT = {found['index_per_k']:.4g} /K"
     )
-    same = equivalent_motions_um(instrument, shift)
-    as_motion = ", ".join(f"{_shift(value)} of {name}" for name, value in same.items())
+    same = ", ".join(f"{_shift(um)} of {name}" for name, um in found["equivalent_um"].items())
     console.print(
-        f"A gradient of {kelvin_per_m:g} K/m along x all the way adds {_shift(shift)} to x: as "
-        f"{as_motion} would"
+        f"A gradient of {kelvin_per_m:g} K/m along x all the way adds {_shift(found['shift_um'])} "
+        f"to x: as {same} would"
     )
-    upward = float(bending_um(instrument, index_gradient(air, 0.0, air.hydrostatic_hpa_per_m)))
-    console.print(f"The weight of the air alone adds {_shift(upward)} along what points upward")
+    upward = _shift(found["weight_of_air_upward_um"])
+    console.print(f"The weight of the air alone adds {upward} along what points upward")
 
 
 def _shift(um: float) -> str:

@@ -80,6 +80,13 @@ class Displacement:
         index = self.names.index(name)
         return float(np.sqrt(self.covariance[index, index]))
 
+    @property
+    def probability(self) -> float:
+        """Of a larger chi2, if only these motions have happened; NaN where nothing is left over."""
+        from scipy.stats import chi2
+
+        return float(chi2.sf(self.chi2, self.ndf)) if self.ndf else math.nan
+
     def as_dict(self) -> dict[str, Any]:
         """For JSON: unit in the names, None where there is no number."""
         found: dict[str, Any] = {}
@@ -87,8 +94,8 @@ class Displacement:
             unit, sigma = motion_unit(name), self.sigma(name)
             found[f"{name}_{unit}"] = self[name]
             found[f"sigma_{name}_{unit}"] = sigma if math.isfinite(sigma) else None
-        chi2 = self.chi2 if math.isfinite(self.chi2) else None
-        return {**found, "chi2": chi2, "ndf": self.ndf}
+        chi2, probability = (self.chi2, self.probability) if self.ndf else (None, None)
+        return {**found, "chi2": chi2, "ndf": self.ndf, "probability": probability}
 
 
 def displacement(

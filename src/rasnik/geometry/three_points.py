@@ -345,8 +345,12 @@ def three_points(
         return ThreePoints(mask_lens_mm, scale * mask_lens_mm, **as_built)
     if scale is not None and lens_sensor_mm is not None:
         return ThreePoints(lens_sensor_mm / scale, lens_sensor_mm, **as_built)
-    named = f"the system {system.name} does not state its distances: give" if system else "give"
-    raise ValueError(f"{named} mask_lens_mm or lens_sensor_mm, and the other or the scale")
+    if system is None:
+        raise ValueError("give two of mask_lens_mm, lens_sensor_mm and scale, or a system")
+    raise ValueError(
+        f"the system {system.name} does not state its distances: give mask_lens_mm or "
+        "lens_sensor_mm"
+    )
 
 
 def motion_index(name: str) -> int:
