@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import replace
+from datetime import UTC, datetime
 
 import numpy as np
 import pytest
@@ -103,6 +104,7 @@ def test_without_a_mass_it_is_no_seismometer():
         ({"network": ""}, "network code ''"),
         ({"location": "0"}, "location code '0' should be two"),
         ({"latitude_deg": 91.0}, "latitude_deg = 91 should be from -90"),
+        ({"elevation_m": math.nan}, "elevation_m = nan should be a number of metres"),
     ],
 )
 def test_wrong_names_are_refused(wrong, sentence):
@@ -444,6 +446,8 @@ def test_exposure_of_the_stored_system_is_in_the_response(tmp_path):
         (("--station", "A", "--start", "2026-01-01"), "counted from 1970 already"),
         (("--station", "A", "--suspension", "none.toml"), "none.toml: there is no such file"),
         (("--station", "A", "--exposure", "1"), "exposure of 1 s does not go with 20 frames/s"),
+        (("--station", "A", "--frame-rate", "20"), "a rate cannot be given as well"),
+        (("--station", "A", "--stationxml", "no/x.xml", "--place", "1,2"), "there is no folder no"),
     ],
 )
 def test_export_says_what_is_wrong(tmp_path, options, sentence):
@@ -451,6 +455,25 @@ def test_export_says_what_is_wrong(tmp_path, options, sentence):
     message = refused("export", tmp_path / "track.csv", "-o", tmp_path / "a.mseed", *options)
     assert sentence in message
     assert not (tmp_path / "a.mseed").exists()
+
+
+def test_a_track_without_times_is_given_its_rate(tmp_path):
+    track = track_of(20, missing=[7])
+    write_track(replace(track, time_s=np.full(len(track), np.nan)), tmp_path / "track.csv")
+    command = ("export", tmp_path / "track.csv", "-o", tmp_path / "a.mseed", "--station", "RAS1")
+    assert "give the rate" in refused(*command)
+    start = ("--start", "2026-11-23T02:10:00")
+    assert rasnik(*command, *start, "--frame-rate", "20").exit_code == 0
+    x = read_miniseed(tmp_path / "a.mseed", metres_per_count=1)[0]
+    assert (x.rate_hz, len(x), x.missing) == (20.0, 20, 1)
+    assert x.start_s == datetime(2026, 11, 23, 2, 10, tzinfo=UTC).timestamp()
+
+
+@pytest.mark.parametrize("frames", [0, 1])
+def test_a_track_without_frames_is_no_recording(tmp_path, frames):
+    write_track(track_of(frames), tmp_path / "track.csv")
+    command = ("export", tmp_path / "track.csv", "-o", tmp_path / "a.mseed", "--station", "RAS1")
+    assert f"two frames at least; the track has {frames}." in refused(*command)
 
 
 def test_options_of_miniseed_belong_to_it(tmp_path):

@@ -50,6 +50,7 @@ def export_command(
     place: seismic.PlaceOption = None,
     count_nm: seismic.CountOption = None,
     start: seismic.StartOption = None,
+    frame_rate: seismic.RateOption = None,
     exposure: seismic.ExposureOption = None,
 ) -> None:
     """Convert a track to CSV, Parquet, miniSEED or lines of ICARAS; or results of images.
@@ -77,7 +78,7 @@ def export_command(
         fail(f"{output} exists already; give another name, or --overwrite to replace it.")
     options = SeismicOptions(
         network, station, location, channels, suspension, frequency, q, on_mass, stationxml,
-        place, count_nm, start, exposure,
+        place, count_nm, start, frame_rate, exposure,
     )  # fmt: skip
     is_seismic = output.suffix.lower() in MINISEED_SUFFIXES
     if options.given and not is_seismic:

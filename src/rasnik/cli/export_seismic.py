@@ -80,6 +80,15 @@ StartOption = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
+RateOption = Annotated[
+    float | None,
+    typer.Option(
+        "--frame-rate",
+        metavar="HZ",
+        help="Of a track that has no times.",
+        rich_help_panel=_PANEL,
+    ),
+]
 ExposureOption = Annotated[
     float | None,
     typer.Option(
@@ -107,12 +116,13 @@ class SeismicOptions:
     place: str | None
     count_nm: float | None
     start: str | None
+    rate_hz: float | None
     exposure_s: float | None
 
     @property
     def given(self) -> bool:
         """Whether any was given that only miniSEED knows."""
-        return self != SeismicOptions("XX", None, "", *[None] * 10)
+        return self != SeismicOptions("XX", None, "", *[None] * 11)
 
 
 def export_seismic(
@@ -129,14 +139,20 @@ def export_seismic(
     from rasnik.io.station_xml import to_inventory, write_station_xml
 
     xml = options.stationxml
+    for one in (output, xml):
+        if one is not None and not one.parent.is_dir():
+            fail(f"{one} cannot be written: there is no folder {one.parent}.")
     if xml is not None and xml.exists() and not overwrite:
         fail(f"{xml} exists already; give another name, or --overwrite to replace it.")
+    if len(track) < 2:
+        fail(f"{path}: miniSEED takes two frames at least; the track has {len(track)}.")
     channels = channels_of(
         track,
         _site(options),
         _directions(options.channels),
         suspension=_suspension(options),
         start_s=_start_s(options.start),
+        rate_hz=options.rate_hz,
         exposure_s=options.exposure_s
         if options.exposure_s is not None
         else exposure_of(path, track),

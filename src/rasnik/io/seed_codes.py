@@ -115,6 +115,9 @@ class Site:
             value = getattr(self, name)
             if value is not None and not -limit <= value <= limit:
                 raise ValueError(f"{name} = {value:g} should be from -{limit} to {limit} degrees")
+        for name in ("elevation_m", "depth_m"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name} = {getattr(self, name):g} should be a number of metres")
 
 
 def band_code(rate_hz: float, corner_s: float) -> str:

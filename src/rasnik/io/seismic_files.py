@@ -115,8 +115,8 @@ class SeismicChannel:
             )
         if not series.start_s >= EARLIEST_S:
             raise ValueError(
-                f"{series.name} begins at {series.start_s:.6g} s, which is not counted from 1970; "
-                "give the time of its first frame in UTC"
+                f"{series.name} begins at {round(series.start_s, 6):g} s, which is not counted "
+                "from 1970; give the time of its first frame in UTC"
             )
         if self.encoding not in ENCODINGS:
             raise ValueError(f"encoding {self.encoding!r} is not one of {', '.join(ENCODINGS)}")
@@ -185,6 +185,7 @@ def channels_of(
     *,
     suspension: Suspension | None = None,
     start_s: float | None = None,
+    rate_hz: float | None = None,
     exposure_s: float = 0.0,
     encoding: Encoding = "FLOAT64",
     count_nm: float | None = None,
@@ -203,6 +204,8 @@ def channels_of(
     start_s : float, optional
         When the first frame was taken, in seconds since 1970 UTC; for a track whose times have
         another zero.
+    rate_hz : float, optional
+        Frames in a second, for a track without times.
 
     Raises
     ------
@@ -212,7 +215,7 @@ def channels_of(
     known = directions if isinstance(directions, Mapping) else dict.fromkeys(directions)
     channels = []
     for place, (column, direction) in enumerate(known.items(), start=1):
-        series = even_series(track, column)
+        series = even_series(track, column, rate_hz=rate_hz)
         if start_s is not None:
             if series.start_s >= EARLIEST_S:
                 raise ValueError(
