@@ -11,9 +11,11 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from rasnik.cli import app
+from rasnik.geometry.adjustment import adjust
 from rasnik.geometry.installation import load_installation
 from rasnik.geometry.network import Network
-from rasnik.geometry.observations import write_readings
+from rasnik.geometry.observations import Readings, write_readings
+from rasnik.report.installation import installation_figure
 
 RUNNER = CliRunner()
 
@@ -92,6 +94,15 @@ def test_wrong_and_missing_readings_are_named(
     assert "wrong: x of A2 by" in text and "; left out" in text
     assert "probability 1" in text
     assert "theta of A1" in text and "redundancy" in text
+
+
+def test_the_title_counts_what_was_used(linked: Network) -> None:
+    values = linked.nominal.copy()
+    values[1, 0] += 40.0
+    wrong = Readings(values, np.full_like(values, np.nan))
+    for reject, used in ((False, 48), (True, 47)):
+        figure = installation_figure(adjust(linked, wrong, reject=reject))
+        assert f"motions from {used} values" in figure.get_suptitle()
 
 
 def test_faulty_rasniks_are_named_and_the_rest_done(tmp_path: Path) -> None:

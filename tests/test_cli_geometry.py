@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.transforms import Bbox
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -15,6 +17,7 @@ from rasnik.cli import app
 from rasnik.geometry.three_points import ThreePoints
 from rasnik.instrument import load_system
 from rasnik.performance.bound import bound
+from rasnik.report.geometry import geometry_figure
 
 RUNNER = CliRunner()
 SMALL = ["solidras", "--set", "sensor.width_px=240", "--set", "sensor.height_px=180"]
@@ -110,6 +113,32 @@ def test_the_drawing(tmp_path: Path) -> None:
     assert "written" in run("--mask-lens-mm", "60", "--lens-sensor-mm", "90", "-o", str(path))
     with Image.open(path) as picture:
         assert picture.size[0] > 900
+
+
+@pytest.mark.parametrize(
+    "instrument",
+    [
+        ThreePoints(2000.0, 3000.0),
+        ThreePoints(10.0, 200.0, orientation=2),
+        ThreePoints(400.0, 20.0, pivot_mm=-100.0),
+    ],
+)
+def test_all_that_is_drawn_can_be_seen(instrument: ThreePoints) -> None:
+    figure = geometry_figure(instrument)
+    figure.canvas.draw()
+    for axes in figure.axes:
+        (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+        for line in axes.lines:
+            x, y = (np.asarray(one, dtype=float) for one in line.get_data())
+            assert x.min() >= left and x.max() <= right and y.min() >= low and y.max() <= high
+        boxes = []
+        for label in axes.get_xticklabels():
+            box, lines = label.get_window_extent(), label.get_text().split("\n")
+            empty = box.height * lines.count("") / len(lines)  # above the words
+            boxes.append(Bbox.from_extents(box.x0, box.y0, box.x1, box.y1 - empty - 1))
+        assert not any(one.overlaps(other) for one, other in itertools.pairwise(boxes))
+    slope = instrument.matrix(["camera_turn_y"])[0, 0] / 1e3
+    assert f"x = {slope:g} mm" in figure.axes[1].get_title()
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from rasnik.geometry.rigid import UM_PER_MM
 from rasnik.geometry.three_points import ThreePoints
 
 __all__ = ["draw_geometry", "geometry_figure"]
@@ -16,6 +17,7 @@ __all__ = ["draw_geometry", "geometry_figure"]
 _DPI = 110
 _MASK, _LENS, _SENSOR, _LIGHT, _FAINT = "#4f8a4f", "#2f6fb3", "#7a4fa3", "#d1762b", "#9a9a9a"
 _HALF = 1.0  # half height of an element in the drawing
+_NEAR = 0.15  # share of the length within which labels would touch
 
 
 def geometry_figure(instrument: ThreePoints) -> Figure:
@@ -27,8 +29,8 @@ def geometry_figure(instrument: ThreePoints) -> Figure:
     FigureCanvasAgg(figure)
     panels = figure.subplots(2, 2)
     for draw, axes in zip((_lens, _camera, _along, _bent), panels.flat, strict=True):
-        draw(axes, instrument)
         _finish(axes, instrument)
+        draw(axes, instrument)
     figure.suptitle(
         f"Mask, lens and sensor: a = {instrument.mask_lens_mm:g} mm, b = "
         f"{instrument.lens_sensor_mm:g} mm, S = b / a = {instrument.scale:.4g} "
@@ -64,9 +66,13 @@ def _camera(axes: Axes, instrument: ThreePoints) -> None:
     axes.plot([a, a + b], [at[a], at[a + b]], color=_LENS, linewidth=5, alpha=0.25,
               solid_capstyle="round")  # fmt: skip
     axes.plot(pivot, 0, "k.", markersize=8)
+    low, high = axes.get_xlim()
+    margin = 0.06 * (max(high, pivot) - min(low, pivot))
+    axes.set_xlim(min(low, pivot - margin), max(high, pivot + margin))
     if at[0.0]:
         _arrow(axes, 0, 0, at[0.0], "x", side=1)
-    axes.set_title(f"camera turned by φ about • : its axis moves by {pivot:g} mm · φ")
+    slope = instrument.matrix(["camera_turn_y"])[0, 0] / UM_PER_MM
+    axes.set_title(f"camera turned by φ about •: x = {round(slope, 9) + 0.0:g} mm · φ")
 
 
 def _along(axes: Axes, instrument: ThreePoints) -> None:
@@ -87,7 +93,7 @@ def _along(axes: Axes, instrument: ThreePoints) -> None:
 def _bent(axes: Axes, instrument: ThreePoints) -> None:
     a, b = instrument.mask_lens_mm, instrument.lens_sensor_mm
     z = np.linspace(0, a + b, 200)
-    bend = 0.8 / (a * (a + b))
+    bend = 0.8 / max(a * (a + b), b * b / 4)  # at the mask, and between lens and sensor
     _elements(axes, instrument)
     axes.plot([0, a + b], [0, 0], color=_FAINT, linestyle="--")
     axes.plot(z, bend * (z - a) * (z - a - b), color=_LIGHT)
@@ -121,7 +127,10 @@ def _finish(axes: Axes, instrument: ThreePoints) -> None:
     axes.set_xlim(-0.06 * (a + b), 1.06 * (a + b))
     axes.set_ylim(-1.6, 1.35)
     axes.set_yticks([])
-    axes.set_xticks([0, a, a + b], ["mask\n0", f"lens\n{a:g}", f"sensor\n{a + b:g}"])
+    labels = ["mask\n0", f"lens\n{a:g}", f"sensor\n{a + b:g}"]
+    # beside a near neighbour the lens is named two lines below
+    labels[1] = "\n\n" * (min(a, b) < _NEAR * (a + b)) + labels[1]
+    axes.set_xticks([0, a, a + b], labels)
     axes.set_xlabel("along the light, mm")
     for side in ("left", "right", "top"):
         axes.spines[side].set_visible(False)

@@ -64,7 +64,7 @@ def _title(found: Adjustment, has_data: bool) -> str:
     name = found.network.installation.name
     if not has_data:
         return f"{name}: what one reading of each Rasnik tells"
-    text = f"{name}: motions from {len(found.checks)} values"
+    text = f"{name}: motions from {sum(one.used for one in found.checks)} values"
     if np.isfinite(found.probability):
         text += f"; chi2 {found.chi2:.1f} for {found.ndf:.3g} degrees of freedom"
     wrong = [f"{one.value} of {one.rasnik}" for one in found.outliers]
