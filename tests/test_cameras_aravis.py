@@ -2,6 +2,7 @@
 
 import re
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -291,3 +292,33 @@ def test_without_aravis_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(__import__("sys").modules, "gi", None)
     with pytest.raises(CameraMissingError, match=re.escape("pip install 'rasnik[camera]'")):
         aravis.AravisCamera("any")
+
+
+@needs_camera
+def test_who_asks_for_counters_does_not_wait_for_a_camera_that_is_connected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It takes seconds if nothing answers; rates and alarms are looked at by who asks."""
+    camera = aravis.AravisCamera("127.0.0.99")
+    connecting, goes_on = threading.Event(), threading.Event()
+
+    def connect() -> None:
+        connecting.set()
+        goes_on.wait(30)
+        raise CameraMissingError("it does not answer.")
+
+    def attempt() -> None:
+        with pytest.raises(CameraMissingError):
+            camera.open()
+
+    monkeypatch.setattr(camera, "_connected", connect)
+    thread = threading.Thread(target=attempt)
+    thread.start()
+    assert connecting.wait(10)
+    asking = threading.Thread(target=camera.counters, daemon=True)
+    asking.start()
+    asking.join(20)
+    waited = asking.is_alive()
+    goes_on.set()
+    thread.join(10)
+    assert not waited

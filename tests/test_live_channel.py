@@ -393,3 +393,46 @@ def test_a_ring_gives_frames_back_in_their_order():
         numbers.append(waiting.arrival.number)
     assert numbers == list(range(4, 12))
     assert ring.finished
+
+
+def test_a_disk_that_hangs_at_a_snapshot_does_not_hold_up_the_end(tmp_path, monkeypatch):
+    camera = ScriptedCamera([camera_frame(0)])
+    channel = make_channel(tmp_path, camera)
+    channel.start()
+    wait_for(lambda: channel.recent.count == 1)
+    began, goes_on = threading.Event(), threading.Event()
+
+    def hang(*_):
+        began.set()
+        goes_on.wait(60)
+
+    monkeypatch.setattr("rasnik.live.channel.save_snapshot", hang)
+    saving = threading.Thread(target=channel.snapshot)
+    saving.start()
+    assert began.wait(10)
+    ending = threading.Thread(target=channel.stop, daemon=True)
+    ending.start()
+    ending.join(30)
+    ended = not ending.is_alive()
+    goes_on.set()
+    saving.join(10)
+    ending.join(30)
+    assert ended
+
+
+def test_an_exposure_that_is_refused_is_kept_as_before(tmp_path, channels, monkeypatch):
+    camera = ScriptedCamera([camera_frame(0)])
+    channel = run(make_channel(tmp_path, camera), channels)
+    channel.keep_exposure(True)
+    wait_for(lambda: channel.recent.count == 1)
+
+    def refuse(_):
+        raise SettingRefusedError("the exposure can be 10 to 20 us.")
+
+    with monkeypatch.context() as refusing:
+        refusing.setattr(camera, "change", refuse)
+        with pytest.raises(SettingRefusedError):
+            channel.set_exposure(5.0)
+    assert channel.keeps_exposure
+    channel.set_exposure(15.0)
+    assert not channel.keeps_exposure

@@ -404,3 +404,21 @@ def test_a_station_that_is_killed_takes_its_page_along(tmp_path: Path) -> None:
         finally:
             made.kill()
         until(lambda: not is_there(int(pid)), "the page ends")
+
+
+def test_a_page_without_answers_is_begun_anew(
+    station: Any, monkeypatch: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its process would answer all that is asked with an error, for ever."""
+    monkeypatch.setattr(process, "_END_S", 0.5)
+    monkeypatch.setattr(process, "_FIRST_WAIT_S", 0.01)
+    unsendable = threading.Lock()
+    with PageProcess(station, Server(port=0)) as page:
+        before = page.pid
+        monkeypatch.setattr(Answers, "_answer", lambda *_: (True, unsendable))
+        httpx.get(page.url + "health")
+        until(lambda: page.pid not in (None, before), "another one is begun")
+        monkeypatch.undo()
+        until(lambda: page.message == "", "all is well")
+        assert httpx.get(page.url + "health").json()["ok"] is True
+    assert "The page has ended" in caplog.text

@@ -129,6 +129,7 @@ class AravisCamera(Camera):
         self._stream: Any = None
         self._lock = threading.RLock()  # around everything but reading
         self._counted = dict.fromkeys((*_COUNTERS, "incomplete"), 0)
+        self._told = dict(self._counted)
         self._last_frame_s = 0.0
         self._lost = False
 
@@ -355,13 +356,22 @@ class AravisCamera(Camera):
             self._begin()
 
     def counters(self) -> dict[str, int]:
-        """Besides the driver's: "incomplete", frames of which a part was missing."""
-        with self._lock:
+        """Besides the driver's: "incomplete", frames of which a part was missing.
+
+        While the camera is connected or set, which takes seconds if it does not answer, the last
+        ones are told again: who asks looks after alarms, too.
+        """
+        if not self._lock.acquire(blocking=False):
+            return self._told
+        try:
             counted = dict(self._counted)
             if self._stream is not None:
                 for name, counter in _COUNTERS.items():
                     counted[name] += self._stream.get_info_uint64_by_name(counter)
-            return counted
+            self._told = counted
+        finally:
+            self._lock.release()
+        return counted
 
 
 def _largest_number(camera: Any) -> int | None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rasnik.analysis.flags import Flag
 from rasnik.analysis.pose import Pose
-from rasnik.cameras.camera import Camera, CameraFrame, CameraSettings
+from rasnik.cameras.camera import Camera, CameraFrame
 from rasnik.instrument import load_system
 from rasnik.live.acquisition import Acquisition, told
 from rasnik.live.light import LightKeeper
@@ -110,6 +110,7 @@ class Channel:
         self._stopping = threading.Event()
         self._stopped = self._started = False
         self._lock = threading.Lock()
+        self._saving = threading.Lock()  # two snapshots at a time would take the same name
         self._threads = [
             threading.Thread(target=self._track, name=f"{config.name} tracking", daemon=True),
             threading.Thread(target=self._look_after, name=f"{config.name} watch", daemon=True),
@@ -212,8 +213,7 @@ class Channel:
         ------
         SettingRefusedError
         """
-        self._light.on = False
-        self._acquisition.change(CameraSettings(exposure_us=us))
+        self._light.set_by_hand(us)
 
     def keep_exposure(self, on: bool) -> None:
         """Whether the exposure is kept where the brightest fields are just below full scale."""
@@ -272,7 +272,7 @@ class Channel:
         if sample is None:
             raise ValueError(f"{self.config.name} has no frame yet to save.")
         folder = self.folder / self.config.name / "snapshots"
-        with self._lock:  # two at a time would take the same name
+        with self._saving:
             return save_snapshot(folder, self.config.name, self.system, sample)
 
     def history(self, start_s: float, end_s: float, points: int) -> dict[str, NDArray[Any]]:

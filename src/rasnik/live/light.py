@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 from rasnik.cameras.camera import CameraError, CameraFrame, CameraSettings
@@ -33,8 +34,21 @@ class LightKeeper:
         self._keeper: ExposureKeeper | None = None
         self._made_for: tuple[int, float | None] = (0, None)
         self._last: CameraFrame | None = None
+        self._lock = threading.Lock()  # who sets by hand is not overruled by a look under way
         self.on = on
         self.message = ""
+
+    def set_by_hand(self, exposure_us: float) -> None:
+        """Set the exposure, which is not kept any more then.
+
+        Raises
+        ------
+        SettingRefusedError
+            Then it is kept as before.
+        """
+        with self._lock:
+            self._acquisition.change(CameraSettings(exposure_us=exposure_us))
+            self.on = False
 
     def look(self, frame: CameraFrame, settings: CameraSettings, full_scale: int) -> None:
         """Judge a frame, and set the exposure if it should be another.
@@ -48,6 +62,14 @@ class LightKeeper:
         full_scale : int
             Highest grey level.
         """
+        if not self._lock.acquire(blocking=False):
+            return  # the exposure is being set
+        try:
+            self._look(frame, settings, full_scale)
+        finally:
+            self._lock.release()
+
+    def _look(self, frame: CameraFrame, settings: CameraSettings, full_scale: int) -> None:
         if not self.on:
             self._keeper, self.message = None, ""
             return

@@ -16,6 +16,7 @@ import threading
 import time
 from contextlib import suppress
 from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING
 
 from rasnik.live.station import Server
@@ -178,15 +179,23 @@ class _Child:
         finally:
             for line in there:
                 line.close()
-        serve = Answers(station).serve
+        self._answers = Answers(station)
         self._threads = [
-            threading.Thread(target=serve, args=(line,), name="page answers", daemon=True)
+            threading.Thread(target=self._answer, args=(line,), name="page answers", daemon=True)
             for line in here
         ]
         for thread in self._threads:
             thread.start()
         with suppress(OSError):  # it may have ended already, which is seen by who waits for it
             self._control.send(Plan(station.config, channels, token))
+
+    def _answer(self, line: Connection) -> None:
+        """What a thread does; without its answers the process would serve errors for ever."""
+        self._answers.serve(line)
+        try:
+            self.process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self.process.terminate()
 
     def wait_until_ready(self) -> None:
         """Return when it answers requests.
