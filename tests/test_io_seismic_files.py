@@ -366,18 +366,23 @@ def test_remove_response_of_obspy_gives_the_ground(tmp_path, rng, output, quanti
 
 def test_place_and_names_in_the_station_xml(tmp_path):
     channels = channels_of(
-        track_of(), SITE, {"x_um": Direction(35), "y_um": Direction(0, -90)}, suspension=MASS
+        track_of(), SITE, {"x_um": Direction(35), "y_um": Direction(360, -90)}, suspension=MASS
     )
     write_station_xml(channels, tmp_path / "a.xml")
     with pytest.raises(FileExistsError, match="exists already"):
         write_station_xml(channels, tmp_path / "a.xml")
+    from obspy.io.stationxml.core import validate_stationxml
+
     inventory = read_inventory(tmp_path / "a.xml")
     (network,) = inventory
     (station,) = network
     assert (network.code, station.code) == ("XX", "RAS1")
     assert (station.latitude, station.longitude, station.elevation) == (52.36, 4.95, -2.0)
     assert [(c.code, c.azimuth, c.dip) for c in station] == [("SH1", 35, 0), ("SHZ", 0, -90)]
-    assert station[0].depth == 10 and "0.8 Hz, Q 2" in station[0].sensor.description
+    # The schema wants azimuths below 360, and the elevation of the sensor, not of the ground.
+    assert validate_stationxml(str(tmp_path / "a.xml")) == (True, ())
+    assert (station[0].elevation, station[0].depth) == (-12, 10)
+    assert "0.8 Hz, Q 2" in station[0].sensor.description
     with pytest.raises(ValueError, match="does not describe XX.RAS2..SHZ"):
         counts_per_metre(inventory, "XX.RAS2..SHZ", time_of(START_S))
 

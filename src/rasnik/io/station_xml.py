@@ -219,9 +219,9 @@ def _channel(one: SeismicChannel) -> Any:
         one.site.location,
         latitude,
         longitude,
-        one.site.elevation_m,
+        one.site.elevation_m - one.site.depth_m,  # of the sensor; of a station it is the ground's
         one.site.depth_m,
-        azimuth=direction.azimuth_deg if direction else None,
+        azimuth=direction.azimuth_deg % 360 if direction else None,  # 360 is not in the schema
         dip=direction.dip_deg if direction else None,
         types=["CONTINUOUS", "GEOPHYSICAL"],
         sample_rate=one.series.rate_hz,
