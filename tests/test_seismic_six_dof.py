@@ -235,9 +235,31 @@ def test_ground_in_six():
         found["ry_rad"].values[inside], grounds["ry_rad"][inside], atol=1e-6 * 2e-3
     )
     assert (found["x_um"].unit, found["ry_rad"].unit) == ("nm", "rad")
+    exposed = motions * np.sinc(f_hz * 0.04)  # the mean of a sine over 40 ms
+    undone = ground_in_six(
+        six.motion(tracks_of(six, six.readings(exposed))), masses, "displacement", band_hz=(0.5, 5),
+        exposure_s=0.04,
+    )  # fmt: skip
+    for name, one in undone.items():
+        size = np.nanmax(found[name].values)
+        np.testing.assert_allclose(one.values[inside], found[name].values[inside], atol=1e-4 * size)
     flat = SixDof(sensor(PARALLEL))
     still = flat.motion(tracks_of(flat, flat.readings(motions)))
     with pytest.raises(ValueError, match="ry of mass is not measured"):
         ground_in_six(still, {"ry_rad": masses["ry_rad"]}, band_hz=(0.2, 5))
     with pytest.raises(ValueError, match="'x' is not one of x_um"):
         ground_in_six(still, {"x": masses["x_um"]}, band_hz=(0.2, 5))
+
+
+def test_errors_of_the_ground_in_six_by_monte_carlo(rng):
+    six = SixDof(sensor(TRIAD))
+    noise = rng.normal(size=(6000, 3, 4)) * [SIGMA_UM, SIGMA_UM, 0, 0]
+    motion = six.motion(tracks_of(six, six.readings(np.zeros((1, 6))) + noise))
+    mass = Suspension(frequency_hz=0.5, q=3.0)
+    found = ground_in_six(motion, dict.fromkeys(DOFS, mass), "acceleration", band_hz=(1.0, 8.0))
+    for one in found.values():
+        # Some 4 Hz of independent values: most of the noise lies at the upper end.
+        tolerance = 4 / math.sqrt(2 * 2 * 4.0 * one.valid / RATE_HZ)
+        assert np.nanstd(one.values) / one.sigma == pytest.approx(1, abs=tolerance)
+    resampled = six.motion(tracks_of(six, six.readings(np.zeros((600, 6)))), resample_hz=7.0)
+    assert np.isnan(list(resampled.sigma.values())).all()

@@ -56,12 +56,16 @@ class SixDofMotion:
         Readings less motions that they measure.
     exact : bool
         Whether the exact model was solved.
+    sigma : dict of float
+        Standard deviation of a value of each series by the noise of the readings, in its unit; NaN
+        where it is not measured or was resampled.
     """
 
     series: dict[str, Series]
     chi2: Array
     degrees_of_freedom: int
     exact: bool
+    sigma: dict[str, float]
 
 
 class SixDof:
@@ -284,17 +288,18 @@ class SixDof:
             shift = 0.0 if absolute else self.network.nominal[k, v] - np.nanmean(own)
             values[:, k, v] = own + shift
         motions, chi2 = self.solve(values, exact=exact)
-        like = series[0]
-        made = {}
+        like, made, sigma = series[0], {}, {}
         for name, column in zip(DOFS, motions.T, strict=True):
             length = name.endswith("_um")
+            size = _NM_PER_UM if length else 1.0
             made[name] = replace(
                 like,
-                values=column * (_NM_PER_UM if length else 1.0),
+                values=column * size,
                 name=f"{name.rpartition('_')[0]} of {self.mass}",
                 unit="nm" if length else "rad",
             )
-        return SixDofMotion(made, chi2, self._freedom, exact)
+            sigma[name] = self.sigma[name] * size if resample_hz is None else np.nan
+        return SixDofMotion(made, chi2, self._freedom, exact, sigma)
 
 
 def ground_in_six(
@@ -303,6 +308,7 @@ def ground_in_six(
     quantity: Quantity = "velocity",
     *,
     band_hz: tuple[float, float],
+    exposure_s: float = 0.0,
 ) -> dict[str, GroundMotion]:
     """Motion of the ground in all degrees of freedom that have a suspension.
 
@@ -312,13 +318,14 @@ def ground_in_six(
     suspensions : mapping
         By the names of `rasnik.geometry.rigid.DOFS`: a mass has a natural frequency and a Q of
         its own in each. What the mass carries (``on_mass``) does not matter here.
-    quantity, band_hz
+    quantity, band_hz, exposure_s
         As in `rasnik.seismic.ground.ground_motion`.
 
     Returns
     -------
     dict of GroundMotion
-        Translations in nm (per s, per s^2), turns in rad.
+        Translations in nm (per s, per s^2), turns in rad; with the errors that the noise of the
+        readings leaves.
 
     Raises
     ------
@@ -341,6 +348,14 @@ def ground_in_six(
         # equation of a turn is that of a length.
         unit = series.unit
         mass = suspension.model_copy(update={"on_mass": "camera"})
-        ground = ground_motion(replace(series, unit="nm"), mass, quantity, band_hz=band_hz)
+        sigma = motion.sigma[name]
+        ground = ground_motion(
+            replace(series, unit="nm"),
+            mass,
+            quantity,
+            band_hz=band_hz,
+            sigma=sigma if np.isfinite(sigma) else None,
+            exposure_s=exposure_s,
+        )
         found[name] = replace(ground, unit=ground.unit.replace("nm", unit))
     return found
