@@ -88,10 +88,10 @@ class Suspects:
             if len(self.by_kind[reason]) < _EACH:
                 text = str(rows.text("error", index) or "no reason is stored")
                 self._keep(rows, index, reason, 1.0, text)
-        for index in rows.flagged(_SCALE.name)[: _EACH - len(self.by_kind["scale"])]:
-            if rows.ok[index]:
-                text = f"the scale is {rows.numbers['scale'][index]:.4g}. {_SCALE.sentence}"
-                self._keep(rows, int(index), "scale", 1.0, text)
+        odd = [k for k in rows.flagged(_SCALE.name) if rows.ok[k]]
+        if odd and not self.by_kind["scale"]:  # one shows it for all of the instrument
+            text = f"the scale is {rows.numbers['scale'][odd[0]]:.4g}. {_SCALE.sentence}"
+            self._keep(rows, int(odd[0]), "scale", 1.0, text)
         for name in ("x", "y"):
             self._largest(rows, f"jump {name}", _deviation(rows, f"{name}_um"))
         self._largest(rows, "chi2_ndf", np.where(rows.ok, rows.numbers["chi2_ndf"], np.nan))

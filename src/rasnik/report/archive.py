@@ -10,6 +10,7 @@ import csv
 import html
 import io
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -104,7 +105,9 @@ def archive_figure(document: Document) -> Figure:
 def draw_overview(document: Document) -> bytes:
     """The figure as a PNG."""
     sink = io.BytesIO()
-    archive_figure(document).savefig(sink, format="png")
+    with warnings.catch_warnings():  # a letter that no font here has is drawn as a box
+        warnings.filterwarnings("ignore", message="Glyph .* missing from font")
+        archive_figure(document).savefig(sink, format="png")
     return sink.getvalue()
 
 
@@ -128,7 +131,8 @@ def _draw_ratios(axes: Axes, instruments: Sequence[Document]) -> None:
     axes.axhline(1.0, color="black", linewidth=1, linestyle="--")
     axes.set_ylabel("scatter between images / stated error")
     axes.set_title("Resolution against the stated error (1: as stated)", fontsize=10)
-    axes.legend(frameon=False)
+    # Beside the title: inside, its signs look like more points.
+    axes.legend(frameon=False, fontsize=8, ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0))
 
 
 def _draw_drifts(axes: Axes, instruments: Sequence[Document]) -> None:
@@ -196,6 +200,7 @@ def _name_instruments(axes: Axes, names: Sequence[str]) -> None:
         axes.set_xlabel(f"instrument, 0 to {len(names) - 1} as in the table")
         return
     labels = [name if len(name) < 20 else f"{name[:18]}…" for name in names]
+    labels = [label.replace("$", r"\$") for label in labels]  # which is for formulas
     axes.set_xticks(range(len(names)), labels, rotation=40, ha="right", fontsize=8)
 
 
