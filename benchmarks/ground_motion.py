@@ -259,7 +259,10 @@ def run(setting: Setting, folder: Path) -> tuple[list[Row], Track, np.ndarray]:
             for k, axis in enumerate(AXES):
                 error, value = judge(setting, truths[k], found[k])
                 size = float(np.sqrt(np.mean((truths[k]) ** 2)))
-                noise = readout_rms(least_nm[k], RATE_HZ, MASS, quantity, band_hz=band_hz)
+                noise = readout_rms(
+                    least_nm[k], RATE_HZ, MASS, quantity, band_hz=band_hz,
+                    exposure_s=0.0 if way == "exposure left in" else EXPOSURE_S,
+                )  # fmt: skip
                 rows.append(
                     Row(
                         quantity, axis, way, error,
