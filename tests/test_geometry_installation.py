@@ -453,6 +453,8 @@ def test_results_of_images_are_known_by_their_file_or_folder() -> None:
         ("a.json", '{"x_um": 1}', "holds no readings"),
         ("a.csv", "x_um\n1\n", "the header line needs a column 'name'$"),
         ("a.csv", "name;x_um\none;1\n", "separated by commas, not by ';'"),
+        ("a.csv", "name,x_um,x_um\none,1,2\n", "x_um must not stand more than once"),
+        ("a.json", '{"one": {"x_um": 1}, "one": {"x_um": 2}}', "one must not stand more than once"),
         ("a.toml", "=", "not valid TOML"),
         ("a.xls", "", "readings are .csv, .json, .jsonl or .toml"),
     ],

@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
@@ -86,18 +87,34 @@ def read_readings(network: Network, path: str | PathLike[str]) -> Readings:
         if suffix == ".csv":
             rows: list[Any] = _table(text, path)
         elif suffix == ".jsonl":
-            rows = [json.loads(line) for line in text.splitlines() if line.strip()]
+            rows = [_json(line, path) for line in text.splitlines() if line.strip()]
         else:
-            rows = _rows(json.loads(text), path)
+            rows = _rows(_json(text, path), path)
     except (json.JSONDecodeError, UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path}: this cannot be read as {suffix[1:]}: {error}") from None
     return parse_readings(network, rows)
+
+
+def _once(names: Sequence[str], path: Path) -> None:
+    """Refuse what readers of files would let the last of its name decide."""
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise ValueError(f"{path}: {', '.join(twice)} must not stand more than once")
+
+
+def _json(text: str, path: Path) -> Any:
+    def table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        _once([name for name, _ in pairs], path)
+        return dict(pairs)
+
+    return json.loads(text, object_pairs_hook=table)
 
 
 def _table(text: str, path: Path) -> list[Any]:
     """Rows of a CSV table."""
     lines = csv.DictReader(text.splitlines(), skipinitialspace=True)
     columns = lines.fieldnames = [one.strip() for one in lines.fieldnames or ()]
+    _once([one for one in columns if one], path)
     if columns and not {"name", "file"} & set(columns):
         other = next((mark for mark in ";\t" if mark in columns[0]), None)
         hint = "" if other is None else f"; columns are separated by commas, not by {other!r}"
