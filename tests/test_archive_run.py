@@ -1,6 +1,7 @@
 """Whole archives: what is left out, what ends its process, what goes on; and real workers."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -100,6 +101,26 @@ def test_a_file_that_was_replaced_keeps_its_row_and_is_told(tmp_path):
     assert run.planner.changed == [str(tmp_path / "s" / "a" / "x.png")]
     run = analyse_archive(tmp_path / "s", tmp_path / "d")
     assert run.planner.unchanged == 1
+
+
+def test_a_stack_that_was_cut_off_is_done_again_once_its_rows_are_removed(tmp_path):
+    """The error of the missing frames stands for the first of them, until then."""
+    path, whole = tmp_path / "s" / "a" / "x.pgm", b""
+    for frame in FRAMES[:4]:
+        whole += b"P5 200 152 255\n" + frame.tobytes()
+    path.parent.mkdir(parents=True)
+    path.write_bytes(whole[: len(whole) * 7 // 10])
+    os.utime(path, (NOON_S, NOON_S))
+    analyse_archive(tmp_path / "s", tmp_path / "d")
+    assert [row["ok"] for row in rows(tmp_path / "d")] == [True, True, False]
+    path.write_bytes(whole)
+    os.utime(path, (NOON_S + 9, NOON_S + 9))
+    run = analyse_archive(tmp_path / "s", tmp_path / "d")
+    assert run.planner.n_changed == 1
+    assert [row["ok"] for row in rows(tmp_path / "d")] == [True, True, False, True]
+    shutil.rmtree(next((tmp_path / "d").glob("instrument=a/day=*")))
+    analyse_archive(tmp_path / "s", tmp_path / "d")
+    assert [row["ok"] for row in rows(tmp_path / "d")] == [True] * 4
 
 
 def test_instruments_without_a_system_are_named_and_done_once_they_have_one(tmp_path):

@@ -158,7 +158,8 @@ def _print_remarks(run: ArchiveRun, dataset: Dataset) -> None:
         _remark(
             f"{planner.n_changed} files have changed since they were analysed "
             f"({_some(planner.changed, planner.n_changed)}): only frames that were added to them "
-            "count, for the others name a new dataset"
+            "count; to have the others done again, errors too, remove the folder of their day or "
+            "instrument in the dataset"
         )
     for name, (sentence, files) in list(planner.refused.items())[:_NAMED]:
         _remark(f"{name}, {files} files left out: {sentence}", "red")

@@ -26,7 +26,7 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+(?:::|://)")
 _PACKED = {".zip": "zip", ".tar": "tar", ".tgz": "tar", ".tar.gz": "tar"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Entry:
     """A file or a folder.
 
