@@ -325,6 +325,9 @@ def test_tracks_without_times(rng):
     with pytest.raises(ValueError, match="neither times nor a frame rate are known"):
         even_series(track)
     assert even_series(track, rate_hz=50.0).rate_hz == 50.0
+    for wrong in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(ValueError, match="frame rate must be a number of hertz above 0, not"):
+            even_series(track, rate_hz=wrong)
     known = Track(**track.as_dict(), metadata={"frame_rate_hz": "860.0"})
     assert even_series(known[::2]).rate_hz == 430.0
     with pytest.raises(ValueError, match="have times; a rate cannot be given"):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rasnik.tracking.track import TRACK_COLUMNS, Track
 
-__all__ = ["COLUMNS", "Series", "aligned", "column_values", "even_series"]
+__all__ = ["COLUMNS", "IrregularTimesError", "Series", "aligned", "column_values", "even_series"]
 
 #: Columns that have a spectrum, and the unit that they are stored in.
 COLUMNS = {c.name: c.unit for c in TRACK_COLUMNS if c.name not in ("frame", "time_s", "flags")}
@@ -24,6 +24,10 @@ COLUMNS = {c.name: c.unit for c in TRACK_COLUMNS if c.name not in ("frame", "tim
 TOLERANCE = 0.05
 
 _UM_TO_NM = 1e3
+
+
+class IrregularTimesError(ValueError):
+    """Times that do not lie on an even grid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,9 +115,11 @@ def even_series(
 
     Raises
     ------
+    IrregularTimesError
+        If the times are not regular.
     ValueError
-        If there is no such column, times and rate are both unknown or both given, or the times
-        are not regular.
+        If there is no such column, times and rate are both unknown or both given, the rate is not
+        above 0, or there are fewer than two frames.
     """
     values, unit = column_values(track, column)
     timed = np.isfinite(track.time_s)
@@ -179,10 +185,12 @@ def _stated_rate(track: Track) -> float:
 def _by_number(track: Track, rate_hz: float | None) -> tuple[NDArray[np.int64], float]:
     """(places, places in a second) from numbers of frames."""
     rate = _stated_rate(track) if rate_hz is None else rate_hz
+    if rate_hz is not None and not (math.isfinite(rate_hz) and rate_hz > 0):
+        raise ValueError(f"the frame rate must be a number of hertz above 0, not {rate_hz:g}")
     if not rate > 0:
         raise ValueError("neither times nor a frame rate are known; give the rate")
     if len(track) < 2:
-        raise ValueError("a spectrum needs more than one frame")
+        raise ValueError("an even series needs more than one frame")
     steps = np.diff(track.frame)
     if (steps < 1).any():
         raise ValueError("the numbers of the frames must increase")
@@ -195,13 +203,13 @@ def _by_time(
 ) -> tuple[NDArray[np.int64], float, float]:
     """(places, time of the first in s, places in a second) from times."""
     if np.count_nonzero(timed) < 2:
-        raise ValueError("a spectrum needs more than one frame with a time")
+        raise ValueError("an even series needs more than one frame with a time")
     first_s = float(track.time_s[timed][0])
     time_s = track.time_s[timed] - first_s
     steps_s = np.diff(time_s)
-    remedy = "take a part without the irregularity, or ask for the Lomb-Scargle periodogram"
+    remedy = "take a part without the irregularity"
     if (steps_s <= 0).any():
-        raise ValueError(f"the times go back or stand still; {remedy}")
+        raise IrregularTimesError(f"the times go back or stand still; {remedy}")
     successive = np.diff(track.frame[timed]) == 1
     step_s = float(np.median(steps_s[successive] if successive.any() else steps_s))
     place = np.zeros(len(time_s), dtype=np.int64)
@@ -212,7 +220,7 @@ def _by_time(
         off = float(np.abs(time_s - offset_s - place * step_s).max() / step_s)
     if doubled or off > tolerance:
         how = "two frames share one" if doubled else f"one is {off:.2g} of an interval beside it"
-        raise ValueError(
+        raise IrregularTimesError(
             f"the times are not regular: each frame should have its place every {step_s:.4g} s, "
             f"but {how}; {remedy}"
         )

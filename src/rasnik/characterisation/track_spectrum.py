@@ -11,7 +11,7 @@ import numpy as np
 
 from rasnik.characterisation.allan import Allan, allan
 from rasnik.characterisation.floor import NoiseFloor, noise_floor
-from rasnik.characterisation.gaps import Series, even_series
+from rasnik.characterisation.gaps import IrregularTimesError, Series, even_series
 from rasnik.characterisation.irregular import lomb_scargle
 from rasnik.characterisation.lines import MAINS_HZ, Line, find_lines
 from rasnik.characterisation.spectrum import Spectrum, welch
@@ -132,7 +132,10 @@ def track_spectrum(
             raise ValueError("irregular times are used as they are; a rate cannot be given as well")
         spectrum = lomb_scargle(track, column, windows=windows, length_s=length_s)
     else:
-        series = even_series(track, column, rate_hz=rate_hz)
+        try:
+            series = even_series(track, column, rate_hz=rate_hz)
+        except IrregularTimesError as error:
+            raise ValueError(f"{error}, or ask for the Lomb-Scargle periodogram") from None
         spectrum = welch(series, windows=windows, length_s=length_s)
         deviation = allan(series)
     lines = find_lines(spectrum, mains_hz=mains_hz)
