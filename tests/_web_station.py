@@ -115,6 +115,9 @@ class FakeChannel:
     def stop_recording(self) -> None:
         self.recording = False
 
+    def keep_frames(self) -> None:
+        self.actions.append(("keep_frames", True))
+
     def snapshot(self) -> Path:
         path = self._folder / "snapshot.png"
         path.write_bytes(b"a picture")

@@ -7,6 +7,7 @@ import threading
 import time
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 from PIL import Image
@@ -436,3 +437,19 @@ def test_an_exposure_that_is_refused_is_kept_as_before(tmp_path, channels, monke
     assert channel.keeps_exposure
     channel.set_exposure(15.0)
     assert not channel.keeps_exposure
+
+
+def test_frames_around_a_moment_are_kept_without_a_recording(tmp_path, channels):
+    camera = ScriptedCamera()
+    raw = {"before_s": 10.0, "after_s": 0.0}
+    channel = make_channel(tmp_path, camera, recording={"enabled": False, "raw": raw})
+    with pytest.raises(ValueError, match="no frame yet to keep"):
+        channel.keep_frames()
+    run(channel, channels)
+    camera.show(*(camera_frame(k) for k in range(5)))
+    wait_for(lambda: channel.recent.count == 5)
+    channel.keep_frames()
+    channel.stop()
+    (path,) = (tmp_path / "one" / "frames").glob("*_asked-for.h5")
+    with h5py.File(path) as file:
+        np.testing.assert_array_equal(file["frames"][:], [IMAGES[k % 4] for k in range(5)])

@@ -408,3 +408,8 @@ def test_last_rows_are_those_of_the_ring(station: Any) -> None:
 
 def test_every_field_of_a_status_is_answered(client: Any) -> None:
     assert set(ChannelStatus.__dataclass_fields__) < set(client.get("/api/channels/top").json())
+
+
+def test_frames_are_kept_when_asked_for(client: Any, station: Any) -> None:
+    assert client.post("/api/channels/side/keep-frames").json()["name"] == "side"
+    assert station.channels["side"].actions[-1] == ("keep_frames", True)

@@ -238,3 +238,44 @@ def test_from_another_address_the_token_is_needed(
         until(page, "window.rasnik?.updates.curves > 1")
         assert lines
         context.close()
+
+
+def test_times_are_those_of_the_station(page: Any) -> None:
+    """A telephone whose clock is an hour late looks at the last 10 minutes all the same."""
+    page.evaluate("(() => { const now = Date.now; Date.now = () => now() - 3_600_000; })()")
+    page.wait_for_timeout(600)  # the station tells its time four times a second
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.get_by_role("button", name="10 min").click()
+    until(page, "document.getElementById('range').textContent.startsWith('From the record')")
+    end = time.monotonic() + WAIT_MS / 1000
+    while not [one for one in asked if "/history?" in one]:
+        assert time.monotonic() < end
+        page.wait_for_timeout(50)
+    query = urlsplit(next(one for one in asked if "/history?" in one)).query
+    end_s = float(dict(part.split("=") for part in query.split("&"))["end"])
+    assert abs(end_s - time.time()) < 60
+
+
+def test_a_finger_looks_closer(browser: Any, url: str) -> None:
+    context = browser.new_context(viewport={"width": 390, "height": 844}, has_touch=True)
+    page = context.new_page()
+    page.goto(url + "#top")
+    until(page, "window.rasnik?.updates.curves > 5")
+    over = page.locator(".plot .u-over").first
+    over.scroll_into_view_if_needed()
+    box = over.bounding_box()
+    y = box["y"] + box["height"] / 2
+    line = context.new_cdp_session(page)
+
+    def touch(kind: str, *places: float) -> None:
+        points = [{"x": box["x"] + x * box["width"], "y": y} for x in places]
+        line.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", 0.3)
+    for step in range(1, 11):
+        touch("touchMove", 0.3 + 0.04 * step)
+    touch("touchEnd")
+    until(page, "document.getElementById('range').textContent.startsWith('From the record')")
+    assert page.get_by_role("button", name="Back").is_visible()
+    context.close()

@@ -253,6 +253,18 @@ class Channel:
     def stop_recording(self) -> None:
         self.recorder.stop()
 
+    def keep_frames(self) -> None:
+        """Keep the raw frames before and after this moment, also while nothing is recorded.
+
+        Raises
+        ------
+        ValueError
+            If there was no frame yet.
+        """
+        if self._latest is None:
+            raise ValueError(f"{self.config.name} has no frame yet to keep.")
+        self.recorder.event("asked for")
+
     def snapshot(self) -> Path:
         """Save the newest frame as an image, and its pose as JSON beside it.
 

@@ -219,6 +219,11 @@ def _clear_zero(station: Station, channel: Channel, values: dict[str, Any]) -> A
     return _done(channel)
 
 
+def _keep_frames(station: Station, channel: Channel, values: dict[str, Any]) -> Any:
+    channel.keep_frames()
+    return _done(channel)
+
+
 def _snapshot(station: Station, channel: Channel, values: dict[str, Any]) -> Any:
     if channel.latest() is None:
         raise ApiError(409, "No frame has come yet; there is nothing to save.")
@@ -261,6 +266,10 @@ ENDPOINTS: tuple[Endpoint, ...] = (
     ),
     Endpoint("POST", f"{_NAME}/zero", "Count from here", "Channel", _zero),
     Endpoint("POST", f"{_NAME}/clear-zero", "Count from the mask's origin", "Channel", _clear_zero),
+    Endpoint(
+        "POST", f"{_NAME}/keep-frames", "Keep the raw frames before and after this moment",
+        "Channel", _keep_frames,
+    ),
     Endpoint("POST", f"{_NAME}/snapshot", "Save the latest frame and its pose", "Saved", _snapshot),
 )  # fmt: skip
 

@@ -35,6 +35,7 @@ _METHODS = frozenset(
         "start_recording",
         "stop_recording",
         "snapshot",
+        "keep_frames",
         "history",
     }
 )

@@ -196,6 +196,9 @@ class RemoteChannel:
     def stop_recording(self) -> None:
         self._do("stop_recording")
 
+    def keep_frames(self) -> None:
+        self._do("keep_frames")
+
     def snapshot(self) -> Path:
         return Path(self._do("snapshot"))
 

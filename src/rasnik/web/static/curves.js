@@ -30,6 +30,8 @@ class Rows {
 
   add(arrays) {
     const more = arrays.time_s.length;
+    // The station's time was set back: rows before that have no place on the same axis.
+    if (this.count && more && arrays.time_s[0] < this.columns.time_s[this.count - 1]) this.clear();
     if (this.count + more > this.size) this.makeRoom(more);
     for (const key of Object.keys(this.columns)) this.columns[key].set(arrays[key], this.count);
     this.count += more;
@@ -85,6 +87,7 @@ export class Curves {
     this.rows = new Rows();
     this.view = { live: 30 };
     this.past = []; // views to go back to
+    this.ahead_s = 0; // of the station's clock before this one
     this.place = document.getElementById("curves");
     this.range = document.getElementById("range");
     this.makeButtons();
@@ -92,6 +95,11 @@ export class Curves {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.make());
     new ResizeObserver(() => this.fit()).observe(this.place);
     setInterval(() => this.refresh(), 3000);
+  }
+
+  /** Times are those of the station, whatever the clock of the viewer says. */
+  setClock(host_time_s) {
+    this.ahead_s = host_time_s - Date.now() / 1000;
   }
 
   // --------------------------------------------------------------- what it looks like
@@ -154,7 +162,7 @@ export class Curves {
         { stroke: ink, grid: { stroke: grid, width: 1 }, ticks: { show: false }, size: 78, space: 28,
           values: (u, ticks) => ticks.map((v) => grouped(v, stepDecimals(ticks))) },
       ],
-      hooks: { setSelect: [(u) => this.selected(u)], ready: [(u) => u.over.addEventListener("dblclick", () => this.back.click())] },
+      hooks: { setSelect: [(u) => this.selected(u)], ready: [(u) => { u.over.addEventListener("dblclick", () => this.back.click()); selectByFinger(u.over); }] },
     }, [[], [], [], []], box);
   }
 
@@ -207,7 +215,7 @@ export class Curves {
 
   async load() {
     const view = this.view;
-    const now = Date.now() / 1000;
+    const now = Date.now() / 1000 + this.ahead_s;
     const [start, end] = view.past ? [now - view.past, now] : [view.start, view.end];
     this.range.textContent = `From the record: ${day(start)} ${clock(start, 1)} to ${clock(end, 1)}.`;
     const points = Math.min(2000, Math.max(200, this.place.clientWidth));
@@ -289,6 +297,29 @@ export class Curves {
     if (plot.series[2].show !== band) { plot.setSeries(2, { show: band }); plot.setSeries(3, { show: band }); }
     plot.setData(data);
   }
+}
+
+/** A finger that moves sideways selects as a mouse does; up and down it moves the page. */
+function selectByFinger(over) {
+  let begun = null;
+  const pass = (kind, { clientX, clientY }) => // uPlot takes no notice of a mouse that has not moved
+    over.dispatchEvent(new MouseEvent(kind, { clientX, clientY, movementX: 1, bubbles: true }));
+  over.addEventListener("pointerdown", (event) => {
+    if (event.pointerType === "mouse" || !event.isPrimary) return;
+    begun = { clientX: event.clientX, clientY: event.clientY };
+    over.setPointerCapture(event.pointerId);
+    pass("mousemove", begun);
+    pass("mousedown", begun);
+  });
+  over.addEventListener("pointermove", (event) => { if (begun && event.isPrimary) pass("mousemove", event); });
+  const end = (event, at) => {
+    if (!begun || !event.isPrimary) return;
+    pass("mousemove", at);
+    pass("mouseup", at);
+    begun = null;
+  };
+  over.addEventListener("pointerup", (event) => end(event, event));
+  over.addEventListener("pointercancel", (event) => end(event, begun)); // the page moved instead
 }
 
 function stepDecimals(ticks) {

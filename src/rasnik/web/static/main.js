@@ -7,7 +7,7 @@ import { Picture } from "./picture.js";
 import { Spectrum } from "./spectrum.js";
 
 const by = (id) => document.getElementById(id);
-let chosen = decodeURIComponent(location.hash.slice(1)) || null;
+let chosen = location.hash.slice(1) || null;
 let channels = [];
 let recording = false;
 let quiet = 0;
@@ -61,6 +61,7 @@ let waiting = false; // rows since the last drawing
 const feed = new Feed({
   status(header) {
     channels = header.channels;
+    curves.setClock(header.host_time_s);
     if (!channels.some((channel) => channel.name === chosen)) choose(channels[0].name);
     const channel = channels.find((one) => one.name === chosen);
     recording = channel.recording;
@@ -126,6 +127,7 @@ by("snapshot").onclick = async () => {
   const saved = await act("snapshot");
   if (saved) tell(`Saved as ${saved.file}`);
 };
+by("keep-frames").onclick = async () => { if (await act("keep-frames")) tell("The raw frames around this moment are kept."); };
 by("exposure").oninput = () => { by("exposure").dataset.changed = "1"; };
 by("exposure-form").onsubmit = async (event) => {
   event.preventDefault();
