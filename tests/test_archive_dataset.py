@@ -149,6 +149,23 @@ def test_a_journal_cut_off_anywhere(source, dataset, finished):
         assert keys(dataset) == EXPECTED, f"cut off at {length}"
 
 
+@pytest.mark.parametrize("spoilt", ["cut off", "settings"])
+def test_rows_that_a_damaged_journal_does_not_name_are_kept_aside(dataset, spoilt):
+    """Their images may be gone. A run that is killed leaves one such chunk at most."""
+    before = {path: path.read_bytes() for path in dataset.glob("*/*/*.parquet")}
+    journal = dataset / "_journal.jsonl"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    kept = lines[:1] if spoilt == "cut off" else [lines[0], b"garbage\n", *lines[2:]]
+    journal.write_bytes(b"".join(kept))
+    with Dataset(dataset) as opened:
+        assert (opened.removed, opened.set_aside) == (0, len(before))
+        assert not opened.totals
+    for path, content in before.items():
+        assert not path.exists()
+        assert path.with_name(f"_{path.name}.aside").read_bytes() == content
+    assert open_dataset(dataset).count_rows() == 0
+
+
 def test_a_journal_spoilt_in_the_middle(source, dataset):
     journal = dataset / "_journal.jsonl"
     lines = journal.read_bytes().splitlines(keepends=True)

@@ -4,6 +4,7 @@ One process writes a dataset at a time, and it alone. The parts of a chunk are w
 each under another name and then renamed; then one line is added to the journal. A part that no
 line of the journal names is of a chunk that was not finished: it is removed when the dataset is
 opened again, and the chunk done again. So every image has one row, whatever is killed and when.
+Parts of more than one such chunk are not from a kill, and are kept under another name.
 A chunk of which a part is missing or cut off counts as not done either.
 """
 
@@ -20,26 +21,28 @@ from hashlib import blake2b
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
-from urllib.parse import quote
 
-from rasnik import __version__
 from rasnik.archive.done import DoneFrames, pack_spans, unpack_spans
+from rasnik.archive.journal import (
+    JOURNAL,
+    DatasetError,
+    Line,
+    folder_name,
+    journal_of,
+    part_name,
+    prepare,
+    read_lines,
+)
 from rasnik.archive.systems_table import InstrumentSettings
 from rasnik.archive.work import Part, Result, Work
 from rasnik.io.file_lock import FileLock
 
 __all__ = ["Dataset", "DatasetError", "Totals", "open_dataset"]
 
-_JOURNAL = "_journal.jsonl"  # readers of Parquet leave out names that begin with _ or .
 _UNFINISHED = "_unfinished-"
 _PART = re.compile(rf"({_UNFINISHED})?part-[0-9a-f]+\.parquet")
-_FORMAT = "rasnik archive 1"
 _WRITERS = 8
 _LONGEST_NAME = 255  # bytes, of a folder on nearly every disk
-
-
-class DatasetError(ValueError):
-    """A folder that cannot be, or go on as, this dataset; says why and what to do."""
 
 
 @dataclass(frozen=True)
@@ -65,28 +68,6 @@ class Totals:
     def __add__(self, other: Totals) -> Totals:
         good, failed = self.good + other.good, self.failed + other.failed
         return Totals(good, failed, self.seconds + other.seconds)
-
-
-@dataclass(frozen=True)
-class _Line:
-    """What the journal says of one chunk; settings by their key, parts as (day, rows, bytes)."""
-
-    chunk: str
-    instrument: str
-    settings: str
-    good: int
-    failed: int
-    seconds: float
-    parts: tuple[tuple[str, int, int], ...]
-    spans: str
-
-    @property
-    def paths(self) -> dict[str, int]:
-        """Size of each part by its path below the dataset."""
-        folder = _folder(self.instrument)
-        return {
-            os.path.join(folder, _part_name(day, self.chunk)): size for day, _, size in self.parts
-        }
 
 
 def _values(settings: InstrumentSettings, track: bool) -> str:
@@ -121,6 +102,8 @@ class Dataset:
         By instrument, of all runs.
     removed : int
         Parts of chunks that were not finished, removed on opening.
+    set_aside : int
+        Parts that a damaged journal does not name, renamed on opening.
 
     Raises
     ------
@@ -138,11 +121,11 @@ class Dataset:
         self.totals: dict[str, Totals] = {}
         self._instruments: dict[str, str] = {}  # and the key of their settings
         self._settings: dict[str, str] = {}  # by key
-        self.removed = 0
-        journal = _journal(path)
+        self.removed = self.set_aside = 0
+        journal = journal_of(path)
         self._lock = FileLock(journal)
         try:
-            _prepare(path, journal)
+            prepare(path, journal)
             self._read(journal)
             self._journal = journal.open("ab")
         except BaseException:
@@ -170,23 +153,44 @@ class Dataset:
         """What is done; and clear away what is not."""
         there = dict(_parts(self.path))
         whole: set[str] = set()
-        for line in _lines(journal):
+        named: set[str] = set()
+        for line in read_lines(journal):
             if isinstance(line, str):
                 self._settings[_key(line)] = line
                 continue
             paths = line.paths
-            if line.settings in self._settings and all(
-                there.get(path) == size for path, size in paths.items()
-            ):
+            if line.settings not in self._settings:
+                continue
+            named.update(paths)
+            if all(there.get(path) == size for path, size in paths.items()):
                 whole.update(paths)
                 self.done.add(unpack_spans(line.spans))
                 self._count(line)
-        for path in there:
-            if path not in whole:
-                (self.path / path).unlink()
+        self._clear([path for path in there if path not in whole], named)
+
+    def _clear(self, spare: list[str], named: set[str]) -> None:
+        """Take away parts that do not count.
+
+        A chunk is written down before the next is begun, so that a run that was killed leaves
+        the parts of one. Where there are more, it is the journal that is damaged: those parts
+        are whole, and their images may be gone.
+        """
+        unknown = {
+            path
+            for path in spare
+            if path not in named and not os.path.basename(path).startswith(_UNFINISHED)
+        }
+        damaged = len(set(map(os.path.basename, unknown))) > 1
+        for path in spare:
+            file = self.path / path
+            if damaged and path in unknown:
+                file.replace(file.with_name(f"_{file.name}.aside"))
+                self.set_aside += 1
+            else:
+                file.unlink()
                 self.removed += 1
 
-    def _count(self, line: _Line) -> None:
+    def _count(self, line: Line) -> None:
         new = Totals(line.good, line.failed, line.seconds)
         self.totals[line.instrument] = self.totals.get(line.instrument, Totals()) + new
         if line.parts:  # else no row was made with them
@@ -200,7 +204,7 @@ class Dataset:
         DatasetError
             If its name is too long for a folder.
         """
-        folder = _folder(instrument)
+        folder = folder_name(instrument)
         if len(folder) > _LONGEST_NAME:
             raise DatasetError(
                 f"the name {instrument} is too long for a folder of the dataset, in which letters "
@@ -237,7 +241,7 @@ class Dataset:
         folder = self.folder_of(chunk.instrument)
         with ThreadPoolExecutor(_WRITERS) as pool:  # each waits for the disk
             list(pool.map(lambda part: _write(folder, chunk.name, part), result.parts))
-        line = _Line(
+        line = Line(
             chunk.name,
             chunk.instrument,
             self._key_of(_values(work.settings, work.track)),
@@ -266,7 +270,7 @@ class Dataset:
 
 def _write(folder: Path, chunk: str, part: Part) -> None:
     """Write a part, complete or not at all."""
-    path = folder / _part_name(part.day, chunk)
+    path = folder / part_name(part.day, chunk)
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(_UNFINISHED + path.name)
     with unfinished.open("wb") as file:
@@ -277,68 +281,6 @@ def _write(folder: Path, chunk: str, part: Part) -> None:
 
 
 # ------------------------------------------------------------------------ files
-
-
-def _journal(path: Path) -> Path:
-    """The journal of a dataset; an empty one if there is none."""
-    journal = path / _JOURNAL
-    if path.exists() and not path.is_dir():
-        raise DatasetError(f"{path} is a file, not a folder with a dataset; name another")
-    if not journal.exists():
-        if path.exists() and any(path.iterdir()):
-            raise DatasetError(
-                f"{path} holds something else than a dataset of this program; name a new folder"
-            )
-        path.mkdir(parents=True, exist_ok=True)
-        journal.touch()
-    return journal
-
-
-def _prepare(path: Path, journal: Path) -> None:
-    """Begin a journal, or see that it can be gone on with."""
-    with journal.open("ab+") as file:
-        file.seek(0)
-        head = file.readline()
-        if not head.endswith(b"\n"):  # new, or killed when it was
-            file.truncate(0)
-            file.write(json.dumps({"format": _FORMAT, "software": __version__}).encode() + b"\n")
-            return
-        file.seek(-1, os.SEEK_END)
-        if file.read(1) != b"\n":  # a line that was being written
-            file.write(b"\n")
-    _check(path, head)
-
-
-def _check(path: Path, head: bytes) -> None:
-    try:
-        about = json.loads(head)
-        kind, version = about["format"], about["software"]
-    except (ValueError, KeyError, TypeError):
-        kind, version = None, None
-    if kind != _FORMAT:
-        raise DatasetError(f"{path / _JOURNAL} is not the journal of a dataset; name a new folder")
-    if version != __version__:
-        raise DatasetError(
-            f"{path} was begun with rasnik {version}, and this is {__version__}, whose results may "
-            "differ; go on with that version, or name a new folder"
-        )
-
-
-def _lines(journal: Path) -> Iterator[_Line | str]:
-    """Settings, and chunks that are done; a line that a crash has spoilt is left out."""
-    with journal.open("rb") as file:
-        next(file)
-        for text in file:
-            try:
-                values = json.loads(text)
-                if "values" in values:
-                    yield str(values["values"])
-                    continue
-                line = _Line(**{**values, "parts": tuple(map(tuple, values["parts"]))})
-                unpack_spans(line.spans)
-            except (ValueError, TypeError, KeyError):
-                continue
-            yield line
 
 
 def _parts(path: Path) -> Iterator[tuple[str, int]]:
@@ -357,15 +299,6 @@ def _parts(path: Path) -> Iterator[tuple[str, int]]:
                     f"{file} was not written by this program, and would be counted with the "
                     "rest; move it out of the dataset"
                 )
-
-
-def _folder(instrument: str) -> str:
-    readable = instrument.encode(errors="backslashreplace")  # names of files need not be text
-    return f"instrument={quote(readable, safe='')}"
-
-
-def _part_name(day: str, chunk: str) -> str:
-    return os.path.join(f"day={day}", f"part-{chunk}.parquet")
 
 
 # ------------------------------------------------------------------------ reading
@@ -394,7 +327,7 @@ def open_dataset(path: str | os.PathLike[str]) -> Any:
         raise ImportError(
             'datasets need pyarrow; install it with: pip install "rasnik[archive]"'
         ) from None
-    if not (Path(path) / _JOURNAL).exists():
+    if not (Path(path) / JOURNAL).exists():
         raise DatasetError(f"{path} holds no dataset of an archive; check the name")
     names = pyarrow.schema([(name, pyarrow.string()) for name in ("instrument", "day")])
     layout = dataset.partitioning(names, flavor="hive")

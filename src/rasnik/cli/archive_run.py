@@ -152,6 +152,13 @@ def _print_remarks(run: ArchiveRun, dataset: Dataset) -> None:
     planner = run.planner
     if dataset.removed:
         _remark(f"{dataset.removed} parts of chunks that were not finished were removed")
+    if dataset.set_aside:
+        _remark(
+            f"{dataset.set_aside} parts that the journal does not name are kept as _part-*.aside "
+            "beside the others: the journal was cut off or damaged, and their images are analysed "
+            "again where they are still there",
+            "red",
+        )
     if planner.unchanged:
         _remark(f"{planner.unchanged} files had been analysed before")
     if planner.n_changed:
@@ -202,6 +209,7 @@ def _document(
         "files_done_before": planner.unchanged,
         "files_changed": planner.n_changed,
         "parts_removed": dataset.removed,
+        "parts_set_aside": dataset.set_aside,
         "refused": {
             name: {"error": sentence, "files": files}
             for name, (sentence, files) in planner.refused.items()
