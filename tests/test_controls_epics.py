@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -221,3 +222,17 @@ def test_a_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "softioc", None)
     with pytest.raises(ImportError, match=r'pip install "rasnik\[epics\]"'):
         EpicsServer(FakeStation(), Epics())
+
+
+@needs_server
+def test_files_beside_the_recordings_are_not_modules(
+    loopback: None, station: FakeStation, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "random.py").write_text("raise SystemExit('a file of the user was run')\n")
+    monkeypatch.chdir(tmp_path)
+    made = EpicsServer(station, Epics(prefix="TEST"))
+    made.start()
+    try:
+        assert made.wait(30), made.message
+    finally:
+        made.stop()

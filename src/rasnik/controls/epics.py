@@ -11,7 +11,6 @@ import json
 import logging
 import os
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
@@ -26,6 +25,7 @@ from rasnik.controls.values import (
     judge,
     statuses,
 )
+from rasnik.live.processes import environment_of_modules, module_command
 from rasnik.live.station import Epics
 
 __all__ = ["EpicsServer", "pv_name"]
@@ -130,7 +130,7 @@ class EpicsServer:
 
     def _serve(self) -> None:
         child = subprocess.Popen(
-            [sys.executable, "-m", "rasnik.controls.ioc"],
+            module_command("rasnik.controls.ioc"), env=environment_of_modules(),
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             text=True, encoding="utf-8", errors="replace",
         )  # fmt: skip

@@ -11,7 +11,6 @@ import logging
 import os
 import socket
 import subprocess
-import sys
 import threading
 import time
 from contextlib import suppress
@@ -19,6 +18,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING
 
+from rasnik.live.processes import environment_of_modules, module_command
 from rasnik.live.station import Server
 from rasnik.web.line import READY, Answers
 from rasnik.web.remote import ChannelPlan, Plan
@@ -169,9 +169,9 @@ class _Child:
         handed = [listener.fileno(), *(line.fileno() for line in there)]
         try:
             self.process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "rasnik.web.process_main", *map(str, handed)],
+                module_command("rasnik.web.process_main", *map(str, handed)),
                 pass_fds=handed, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-                env=_environment(),
+                env=environment_of_modules(),
                 start_new_session=True,  # Ctrl-C is for the station, which ends this
             )  # fmt: skip
         except OSError as error:
@@ -243,8 +243,3 @@ class _Child:
             thread.join(1.0)  # one may be at something that takes long
         self._control.close()
         return f"signal {-status}" if status < 0 else f"exit status {status}"
-
-
-def _environment() -> dict[str, str]:
-    """The same modules as here."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
