@@ -372,10 +372,10 @@ def test_what_is_missing_is_said(station: Any, tmp_path: Path, monkeypatch: Any)
 
 
 def test_a_start_that_fails_is_said(station: Any, monkeypatch: Any) -> None:
-    monkeypatch.setattr(process.sys, "executable", "/bin/false")
+    monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(PageError, match="ended at its start .exit status 1."):
         PageProcess(station, Server(port=0)).start()
-    monkeypatch.setattr(process.sys, "executable", "/no/such/python")
+    monkeypatch.setattr(sys, "executable", "/no/such/python")
     with pytest.raises(PageError, match="cannot be started"):
         PageProcess(station, Server(port=0)).start()
 
