@@ -1,6 +1,6 @@
 """An archive analysed while its processes are killed: is each image there once, and how fast.
 
-    python benchmarks/archive_study.py --images 2000 --instruments 10
+    python benchmarks/archive_study.py --images 10000 --instruments 10
 
 Makes images of known positions as folders of PNG and TIFF, stacks in TIFF, HDF5 and Zarr, some
 damaged, blank or jumping. Then `rasnik archive analyse` is run by two workers; one of them, and
@@ -282,7 +282,7 @@ def finish(process: subprocess.Popen[bytes], total: int, dataset: Path) -> None:
 
 def kill_worker(root: psutil.Process) -> None:
     victims = workers_of(root)
-    assert victims, "there are no workers"
+    assert victims, "the run ended before a worker could be killed; take more images"
     victims[0].kill()
 
 
