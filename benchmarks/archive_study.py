@@ -488,7 +488,7 @@ def tell(text: str, end: str = "\n") -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--images", type=int, default=2000)
+    parser.add_argument("--images", type=int, default=10_000)
     parser.add_argument("--instruments", type=int, default=10)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--kills", type=int, default=2, help="times the whole run is killed")
