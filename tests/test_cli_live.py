@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import io
 import os
 import re
 import signal
@@ -15,10 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from _live_camera import IMAGES, write_system
+from rasnik.cli.live_table import Announcer
 from rasnik.io import read_track
 from rasnik.live.station import StationConfig, load_station
+from rasnik.live.status import ChannelStatus
 from test_cli import rasnik, refused
 
 PAGE = all(importlib.util.find_spec(name) for name in ("starlette", "uvicorn", "websockets"))
@@ -152,3 +156,18 @@ def test_what_does_not_go_together_is_refused(station):
 def test_other_addresses_need_a_token(station):
     message = refused("live", station, "--host", "0.0.0.0", "--port", "0")
     assert "token_file" in message
+
+
+def test_every_line_of_the_log_names_its_channel():
+    console = Console(file=io.StringIO(), width=200)
+    alarm, full = "x is 12 um, above 10 um", "The disk is full."
+    statuses = [
+        ChannelStatus("one", state="running", camera="a camera", alarms=(alarm,)),
+        ChannelStatus("two", state="lost", camera="another", recording_message=full),
+    ]
+    announcer = Announcer(console, "")
+    announcer.tell(statuses)
+    announcer.tell(statuses)
+    assert console.file.getvalue().splitlines() == [  # type: ignore[attr-defined]
+        "one (a camera): running", f"one: alarm: {alarm}", "two (another): lost", f"two: {full}",
+    ]  # fmt: skip

@@ -68,7 +68,8 @@ class Announcer:
     def tell(self, statuses: Sequence[ChannelStatus]) -> None:
         """Say what is new since the last time."""
         for status in statuses:
-            now = (f"{status.name} ({status.camera}): {status.state}", *_wrong(status))
+            wrong = [f"{status.name}: {text}" for text in _wrong(status)]
+            now = (f"{status.name} ({status.camera}): {status.state}", *wrong)
             before = self._said.get(status.name, ())
             if now != before:
                 self._said[status.name] = now
