@@ -32,8 +32,7 @@ from rasnik.tracking.tracker import Tracker
 __all__ = ["Channel"]
 
 _BUFFER_BYTES = 64 << 20  # 0.6 s of 720 x 540 pixels of 8 bits at 275 Hz
-_POLL_S = 0.2
-_WATCH_S = 0.2
+_POLL_S = _WATCH_S = 0.2
 _ZERO_S = 1.0  # over which positions are averaged for a zero
 _NAN = float("nan")
 
