@@ -29,7 +29,7 @@ from rasnik.web.openapi import document  # noqa: E402
 from rasnik.web.packets import pack, unpack  # noqa: E402
 from rasnik.web.picture import lattice  # noqa: E402
 from rasnik.web.quantities import QUANTITIES  # noqa: E402
-from rasnik.web.rows import last_rows  # noqa: E402
+from rasnik.web.rows import last_rows, torn  # noqa: E402
 from rasnik.web.server import PageServer  # noqa: E402
 from rasnik.web.spectra import live_spectrum  # noqa: E402
 
@@ -404,6 +404,21 @@ def test_last_rows_are_those_of_the_ring(station: Any) -> None:
         rows, following = last_rows(recent, seconds)
         assert np.array_equal(rows["frame"], recent.last(seconds)["frame"])
         assert following == recent.count
+
+
+def test_no_line_is_drawn_across_missing_frames() -> None:
+    rows = np.zeros(4, RECENT_ROW)
+    rows["frame"], rows["host_time_s"], rows["x_um"] = (
+        [7, 8, 12, 13],
+        [1, 2, 6, 7],
+        [10, 11, 12, 13],
+    )
+    found = torn(rows, None)
+    np.testing.assert_array_equal(found["x_um"], [10, 11, np.nan, 12, 13])
+    np.testing.assert_array_equal(found["host_time_s"], [1, 2, 6, 6, 7])
+    np.testing.assert_array_equal(torn(rows, 5)["x_um"], [np.nan, 10, 11, np.nan, 12, 13])
+    np.testing.assert_array_equal(torn(rows[:2], 6)["x_um"], [10, 11])
+    assert len(torn(rows[:0], 6)) == len(torn(rows[:0], None)) == 0
 
 
 def test_every_field_of_a_status_is_answered(client: Any) -> None:

@@ -22,7 +22,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from rasnik.web.packets import pack
 from rasnik.web.picture import Pictures
 from rasnik.web.quantities import QUANTITIES, channel_dict, finite
-from rasnik.web.rows import last_rows
+from rasnik.web.rows import last_rows, torn
 from rasnik.web.spectra import Spectra
 
 if TYPE_CHECKING:
@@ -116,6 +116,7 @@ class _Client:
         self._wishes = _Wishes()
         self._changed = True
         self._unseen = 0
+        self._drawn: int | None = None  # number of the last frame in the curves
 
     # ------------------------------------------------------------------ what it says
 
@@ -203,10 +204,12 @@ class _Client:
         rows = rows[-_MOST_ROWS:]
         if not len(rows) and not first:
             return following
+        drawn = torn(rows, None if first else self._drawn)
+        self._drawn = int(rows["frame"][-1]) if len(rows) else None
         status = channel.status()
-        arrays: dict[str, Any] = {"time_s": rows["host_time_s"].astype(np.float64)}
+        arrays: dict[str, Any] = {"time_s": drawn["host_time_s"].astype(np.float64)}
         for quantity in QUANTITIES:
-            arrays[quantity.key] = quantity.shown(rows[quantity.column], status)
+            arrays[quantity.key] = quantity.shown(drawn[quantity.column], status)
         header = {
             "kind": "rows",
             "channel": wishes.channel,
