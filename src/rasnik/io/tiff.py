@@ -86,6 +86,8 @@ def _frames(tif: Any, size: int) -> tuple[list[tuple[Any, int | None]], bool]:
     """(page, None) or (series, index) of every frame, and whether all are in the file."""
     frames: list[tuple[Any, int | None]] = []
     complete = True
+    if len(tif.series) == 1 and tif.is_uniform:
+        tif.pages.useframes = True  # of pages that are alike only what differs is read
     for series in tif.series:
         pages = [page for page in series.pages if page is not None]
         if not pages or pages[0].keyframe.is_reduced:
