@@ -19,6 +19,8 @@ from rasnik.live.priority import give_way
 
 __all__ = ["main"]
 
+_LOOK_S = 0.5
+
 
 def main() -> None:
     """Serve until the station says stop, or is gone."""
@@ -52,7 +54,9 @@ def _serve(station: Any, token: str | None, listener: socket.socket, control: Co
         return
     try:
         control.send_bytes(READY)
-        control.recv_bytes()
+        # A signal may come to another thread, and is seen when this one goes on.
+        while not control.poll(_LOOK_S):
+            pass
     finally:
         serving.stop()
 
