@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 import urllib.request
 from pathlib import Path
@@ -19,6 +20,7 @@ from PIL import Image
 from rich.console import Console
 
 from _live_camera import IMAGES, write_system
+from rasnik.cli.live_run import _asked_to_end
 from rasnik.cli.live_table import Announcer
 from rasnik.io import read_track
 from rasnik.live.station import StationConfig, load_station
@@ -171,3 +173,13 @@ def test_every_line_of_the_log_names_its_channel():
     assert console.file.getvalue().splitlines() == [  # type: ignore[attr-defined]
         "one (a camera): running", f"one: alarm: {alarm}", "two (another): lost", f"two: {full}",
     ]  # fmt: skip
+
+
+def test_who_asks_to_end_is_heard_while_it_waits_and_afterwards():
+    with _asked_to_end() as asked:
+        assert not asked.wait(0.01)
+        later = threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGTERM))
+        later.start()
+        assert asked.wait(20)
+        assert asked.wait(0.01)
+        later.join()

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import queue
 import signal
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -55,10 +55,33 @@ def run_live(config: StationConfig, seconds: float | None, page: bool) -> int:
     return 1 if failed else 0
 
 
+class _Asked:
+    """Whether somebody asked to end.
+
+    Set by a signal handler, which `threading.Event` may not be: the handler would wait for a
+    lock that is held by what it interrupts.
+    """
+
+    def __init__(self) -> None:
+        self._asked: queue.SimpleQueue[None] = queue.SimpleQueue()
+
+    def set(self) -> None:
+        self._asked.put(None)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it was set before the time was over, or before this call."""
+        try:
+            self._asked.get(timeout=timeout_s)
+        except queue.Empty:
+            return False
+        self.set()
+        return True
+
+
 @contextmanager
-def _asked_to_end() -> Iterator[threading.Event]:
+def _asked_to_end() -> Iterator[_Asked]:
     """Set by SIGINT and SIGTERM; a second one changes nothing, as the record is being closed."""
-    asked = threading.Event()
+    asked = _Asked()
     before = {
         number: signal.signal(number, lambda *_: asked.set())
         for number in (signal.SIGINT, signal.SIGTERM)
@@ -115,7 +138,7 @@ def _start(services: list[Any]) -> str:
 # ------------------------------------------------------------------------ while it runs
 
 
-def _show(station: Station, url: str, asked: threading.Event, end_s: float | None) -> None:
+def _show(station: Station, url: str, asked: _Asked, end_s: float | None) -> None:
     """Show what happens, until somebody asks to end, the time is over, or no frames come."""
     console = messages()
     announcer = Announcer(console, url)
