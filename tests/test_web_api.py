@@ -321,7 +321,7 @@ def test_a_client_that_confirms_nothing_gets_two_pictures(tmp_path: Path) -> Non
     channel.start()
     try:
         with PageServer(station, Server(port=0)) as server:
-            got = heard(server.url, {"channel": "one", "image_hz": 30}, 1.0, seen=False)
+            got = heard(server.url, {"channel": "one", "image_hz": 30}, 3.0, seen=False)
     finally:
         channel.stop()
     kinds = [header["kind"] for header, _ in got]
