@@ -39,7 +39,7 @@ from rasnik.live.station_file import station_toml  # noqa: E402
 REPLAYED = 64  # frames, again and again
 LONGEST_END_S = 30.0
 GROWTH_MIB_PER_HOUR = 16.0  # of the trend after the first quarter
-BY_CHANCE = 2.0  # standard errors that the trend may be above it
+NOISE_MIB = 12.0  # what the trend of a short run may come to by chance
 SAID = re.compile(
     r"^(\w+): (\d+) frames, (\d+) with a position, (\d+) lost, (\d+) dropped, (\d+) recorded"
 )
@@ -177,17 +177,18 @@ def accounts(lines: list[str], folder: Path) -> list[dict[str, Any]]:
     return found
 
 
-def trend(samples: list[dict[str, float]]) -> tuple[float, float]:
-    """(slope, standard error) of the memory after the first quarter, in MiB an hour.
+def trend(samples: list[dict[str, float]]) -> tuple[float, float, float]:
+    """Memory after the first quarter: (slope, its standard error) in MiB an hour, growth in MiB.
 
     Memory goes up and down by some 20 MiB from reading to reading; in an hour the slope is known to
     about as much.
     """
     later = samples[len(samples) // 4 :]
     if len(later) < 4:
-        return float("nan"), float("nan")
-    line = linregress([s["s"] / 3600 for s in later], [s["rss_mib"] for s in later])
-    return float(line.slope), float(line.stderr)
+        return float("nan"), float("nan"), float("nan")
+    hours = [sample["s"] / 3600 for sample in later]
+    line = linregress(hours, [sample["rss_mib"] for sample in later])
+    return float(line.slope), float(line.stderr), float(line.slope) * (hours[-1] - hours[0])
 
 
 def main() -> None:
@@ -215,17 +216,17 @@ def main() -> None:
         finally:
             child.process.kill()
         table = accounts(child.lines, folder / "data")
-    slope, error = trend(samples)
+    slope, error, growth = trend(samples)
     cpu = samples[-1]["cpu_s"] / samples[-1]["s"]
     print(f"\n{'channel':12}" + "".join(f"{key:>17}" for key in list(table[0])[1:]))
     for row in table:
         print(f"{row['channel']:12}" + "".join(f"{row[key]!s:>17}" for key in list(row)[1:]))
-    flat = not slope - BY_CHANCE * error > GROWTH_MIB_PER_HOUR
+    flat = not (slope > GROWTH_MIB_PER_HOUR and growth > NOISE_MIB)
     complete = len(table) == options.cameras + options.replays
     clean = status == 0 and not any("Traceback" in line for line in child.lines)
     print(
         f"\nmemory {samples[0]['rss_mib']:.0f} MiB first, {samples[-1]['rss_mib']:.0f} MiB last, "
-        f"{slope:+.1f} +- {error:.1f} MiB/h after the first quarter: "
+        f"{slope:+.1f} +- {error:.1f} MiB/h after the first quarter ({growth:+.1f} MiB): "
         f"{'flat' if flat else 'GROWS'}\n"
         f"threads {samples[0]['threads']:g} first, {samples[-1]['threads']:g} last; open files "
         f"{samples[0]['files']:g} first, {samples[-1]['files']:g} last; {cpu:.2f} cores\n"

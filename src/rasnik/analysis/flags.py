@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntFlag
 
-__all__ = ["FLAGS", "Flag", "FlagInfo"]
+__all__ = ["FLAGS", "Flag", "FlagInfo", "info_of"]
 
 
 class Flag(IntFlag):
@@ -230,3 +230,8 @@ FLAGS: tuple[FlagInfo, ...] = (
         "Show more of the mask if the mask may have moved by several fields.",
     ),
 )
+
+
+def info_of(flag: Flag) -> FlagInfo:
+    """The row of a single flag."""
+    return next(info for info in FLAGS if info.flag is flag)

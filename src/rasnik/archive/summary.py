@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rasnik.analysis.flags import FLAGS, Flag
+from rasnik.analysis.flags import FLAGS, Flag, info_of
 from rasnik.archive.drift import Drift, drift
 from rasnik.archive.rows import NUMBERS, Faults, Part, Rows, instruments_of, read_rows
 from rasnik.archive.worst import Suspects, Worst, choose
@@ -34,7 +34,7 @@ _RUN = 1_000
 _PAUSE = 5.0  # usual intervals; after a longer one images do not follow each other
 _GAP = 10  # by more than this a pause adds to the number of an image
 _FATAL = [info.name for info in FLAGS if info.fatal]
-_SCALE = next(info for info in FLAGS if info.flag is Flag.SCALE_UNEXPECTED)
+_SCALE = info_of(Flag.SCALE_UNEXPECTED)
 _COORDINATES = {"x": ("x_um", 1e3), "y": ("y_um", 1e3)}  # and the factor to nm
 _LEVELS = ("chi2_ndf", "blur_um", "light_level")
 _PERCENTILES = (5.0, 50.0, 95.0)

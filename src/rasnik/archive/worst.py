@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rasnik.analysis.flags import FLAGS, Flag
+from rasnik.analysis.flags import Flag, info_of
 from rasnik.archive.rows import Rows
 
 __all__ = ["Suspects", "Worst", "choose"]
@@ -26,7 +26,7 @@ _EACH = 10  # kept of a kind and an instrument
 _JUMP = 6.0  # times the scatter of a single image
 _TIMES = 1.5  # times the median of the instrument
 _BESIDE_FAILURES = ("scale", "jump", "misfit", "uncertain")
-_SCALE = next(info for info in FLAGS if info.flag is Flag.SCALE_UNEXPECTED)
+_SCALE = info_of(Flag.SCALE_UNEXPECTED)
 #: Error of a mean of neighbours against the image between them: sqrt(1 + 1/2).
 _AGAINST_NEIGHBOURS = math.sqrt(1.5)
 

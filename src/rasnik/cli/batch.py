@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, TextIO
 from rich.markup import escape
 
 from rasnik.cli.common import fail, messages, output
+from rasnik.cli.files import check_folder
 from rasnik.io.analysed import AnalysisOptions, analysed, frame_name
 from rasnik.io.images import Frame, Source, count_frames, expand_paths, iter_frames
 
@@ -118,8 +119,7 @@ def _open_writer(
     path = destination.file
     if any(source.path.exists() and _same_file(source.path, path) for source in sources):
         fail(f"{path} is one of the images and would be overwritten; name another file.")
-    if not path.parent.is_dir():
-        fail(f"{path} cannot be written: there is no folder {path.parent}.")
+    check_folder(path)
     try:
         if path.suffix.lower() == ".txt":
             return opened.enter_context(_lwdaq_writer(path, options))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rasnik.cli.common import fail, numbers
-from rasnik.cli.files import exposure_of
+from rasnik.cli.files import check_folder, check_frames, exposure_of
 from rasnik.cli.seismic_options import OnMass
 
 if TYPE_CHECKING:
@@ -140,12 +140,11 @@ def export_seismic(
 
     xml = options.stationxml
     for one in (output, xml):
-        if one is not None and not one.parent.is_dir():
-            fail(f"{one} cannot be written: there is no folder {one.parent}.")
+        if one is not None:
+            check_folder(one)
     if xml is not None and xml.exists() and not overwrite:
         fail(f"{xml} exists already; give another name, or --overwrite to replace it.")
-    if len(track) < 2:
-        fail(f"{path}: miniSEED takes two frames at least; the track has {len(track)}.")
+    check_frames(path, track, "miniSEED")
     channels = channels_of(
         track,
         _site(options),

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 __all__ = [
     "TRACK_FILES",
     "PlotOption",
+    "check_folder",
+    "check_frames",
     "check_outputs",
     "exposure_of",
     "read_stored",
@@ -41,9 +43,20 @@ def check_outputs(paths: list[Path] | None, suffixes: tuple[str, ...]) -> list[P
     for path in paths or ():
         if path.suffix.lower() not in suffixes:
             fail(f"{path}: the name must end in {', '.join(suffixes)}.")
-        if not path.parent.is_dir():
-            fail(f"{path} cannot be written: there is no folder {path.parent}.")
+        check_folder(path)
     return list(paths or ())
+
+
+def check_folder(path: Path) -> None:
+    """End the command if there is no folder for a file that is to be written."""
+    if not path.parent.is_dir():
+        fail(f"{path} cannot be written: there is no folder {path.parent}.")
+
+
+def check_frames(path: Path, track: Track, what: str) -> None:
+    """End the command if a track is too short for what is to be made of it."""
+    if len(track) < 2:
+        fail(f"{path}: {what} takes two frames at least; the track has {len(track)}.")
 
 
 def read_stored(path: Path) -> Track:

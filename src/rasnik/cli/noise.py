@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rasnik.cli.common import fail, load, messages, output
-from rasnik.cli.files import PlotOption, written
+from rasnik.cli.files import PlotOption, check_folder, written
 from rasnik.cli.predict import SetOption
 
 if TYPE_CHECKING:
@@ -114,8 +114,8 @@ def _check_writable(plot: Path | None, system_file: Path | None) -> None:
     if system_file is not None and system_file.suffix.lower() != ".toml":
         fail(f"{system_file}: systems are written as TOML; end the name in .toml.")
     for path in (plot, system_file):
-        if path is not None and not path.parent.is_dir():
-            fail(f"{path} cannot be written: there is no folder {path.parent}.")
+        if path is not None:
+            check_folder(path)
 
 
 def _measure(

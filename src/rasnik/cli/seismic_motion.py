@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rasnik.cli.common import fail, messages, output
-from rasnik.cli.files import check_outputs, exposure_of, read_stored, written
+from rasnik.cli.files import check_frames, check_outputs, exposure_of, read_stored, written
 from rasnik.cli.seismic_options import (
     PLOTS,
     Axis,
@@ -165,8 +165,7 @@ def ground_command(
 def _track(path: Path) -> Track:
     """A track that has frames, or the end of the command."""
     track = read_stored(path)
-    if len(track) < 2:
-        fail(f"{path}: a motion takes two frames at least; the track has {len(track)}.")
+    check_frames(path, track, "a motion")
     return track
 
 

@@ -9,6 +9,7 @@ import typer
 
 from rasnik.cli.analyse import Model
 from rasnik.cli.common import fail, load
+from rasnik.cli.files import check_folder
 
 if TYPE_CHECKING:
     import numpy as np
@@ -150,8 +151,7 @@ def _check_plot(path: Path) -> None:
     """A plot that cannot be written must not come out at the end of a long run."""
     if path.suffix.lower() not in (".png", ".pdf", ".svg"):
         fail(f"{path}: plots are written as .png, .pdf or .svg.")
-    if not path.parent.is_dir():
-        fail(f"{path} cannot be written: there is no folder {path.parent}.")
+    check_folder(path)
 
 
 def _read_times(path: Path) -> NDArray[np.float64]:

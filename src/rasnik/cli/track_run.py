@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rich.markup import escape
 
 from rasnik.cli.common import fail, messages
+from rasnik.cli.files import check_folder
 from rasnik.cli.track_summary import Summary
 from rasnik.cli.track_terminal import Interrupts, progress
 from rasnik.io.analysed import frame_name
@@ -121,8 +122,8 @@ def _prepare_file(frames: list[str], sources: list[Source], options: Options) ->
     """Number of the first frame to be tracked; what must not be lost is not touched."""
     path = options.file
     if path is None or not path.exists():
-        if path is not None and not path.parent.is_dir():
-            fail(f"{path} cannot be written: there is no folder {path.parent}.")
+        if path is not None:
+            check_folder(path)
         return 0
     if any(source.path.exists() and os.path.samefile(source.path, path) for source in sources):
         fail(f"{path} is one of the images and would be overwritten; name another file.")

@@ -34,7 +34,8 @@ class Recent:
     """
 
     def __init__(self, rows: int = _ROWS) -> None:
-        self._rows = np.zeros(rows, dtype=RECENT_ROW)
+        self._rows = np.empty(rows, dtype=RECENT_ROW)
+        self._rows[:] = 0  # memory taken now: as rows come it would look like a leak
         self._count = 0
         self._lock = threading.Lock()
 
